@@ -44,7 +44,7 @@ from neuroprior.control import ICEMPlanner, MPPIPlanner, NoisePrior, ShootingPla
 from neuroprior.planners import expected_score, value_iteration
 from neuroprior.plans import all_plans, folds, in_parts
 from neuroprior.priors import CombinedPrior, StackedPrior, SwitchingPrior
-from neuroprior.puzzles import AStarPlanner, PatternCounts
+from neuroprior.puzzles import AStarPlanner
 from neuroprior.training import Settings
 from neuroprior.worlds import four_rooms, maze
 from tests.support.sources import refuses, seeded
@@ -59,7 +59,7 @@ NONE_OF_THEM = [nan, True, "1"]
 """What is no number in any range."""
 
 POSITIVE = {
-    "smoothing": [partial(MarkovPrior, 3, 1), partial(PatternCounts, 3, 2)],
+    "smoothing": [partial(MarkovPrior, 3, 1)],
     "alpha": [partial(ContextTreePrior, 3)],
     "temperature": [
         partial(UNIFORM.sample, 2, 2),

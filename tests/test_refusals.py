@@ -20,7 +20,7 @@ from neuroprior.control import (
     write_vector_plans,
 )
 from neuroprior.priors import SwitchingPrior, forecast, infer, load, save
-from neuroprior.puzzles import BoardNetwork, LogLinearPrior, SokobanWorld, Steps, read_sokoban, sliding_tiles, sokoban
+from neuroprior.puzzles import LogLinearPrior, SokobanWorld, Steps, read_sokoban, sliding_tiles, sokoban
 from neuroprior.worlds import cube, gridworld
 from tests.support.sources import refuses, seeded
 
@@ -58,12 +58,11 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "the last plan by its number": (lambda: Plans(ZEROS, 1)[-1], "plans[-1 : ] is"),
     "patterns of others": (lambda: Plans(ZEROS, 1, context=torch.zeros(2, 4, 5, dtype=torch.int32)), "[2, 3, F]"),
     "no patterns": (lambda: LogLinearPrior(2, 2).start(1), "context"),
-    "no board": (lambda: BoardNetwork(2, (3, 3, 4)).start(1), "context"),
     "patterns of other steps": (
         lambda: LogLinearPrior(2, 2).fit_steps(Steps(ZEROS[:, :1], ZEROS[0], ZEROS[0], ZEROS[0])),
         "shape",
     ),
-    "levels of no width": (lambda: SokobanWorld(torch.zeros(0, 3, 3), (), "board"), "levels"),
+    "levels of no width": (lambda: SokobanWorld(torch.zeros(0, 3, 3), ()), "levels"),
     "a prior that is none": (lambda: infer({"a": 3}, ZEROS), "priors['a']"),
     "what no prior allows": (
         lambda: forecast(

@@ -5,6 +5,7 @@ from torch import Tensor
 
 from eval.puzzles.contest import LETTERS
 from neuroprior.puzzles import PuzzleWorld, SlidingTilesWorld
+from neuroprior.puzzles.worlds import rules
 
 CELL = 32
 """Pixels of a cell."""
@@ -25,24 +26,29 @@ def animation(world: PuzzleWorld, board: Tensor, moves: str) -> str:
     parts = [f'<rect width="{width * CELL}" height="{height * CELL}" fill="{FLOOR}"/>']
     if isinstance(world, SlidingTilesWorld):
         for tile in range(1, height * width):
-            parts.append(_moving(_tile(tile), [int((s == tile).flatten().long().argmax()) for s in states], width))
+            parts.append(_moving(_tile(tile), [_first_cell(state == tile) for state in states], width))
     else:
-        kinds = world.kinds(board[None])[0].flatten().tolist()
-        for cell, kind in enumerate(kinds):
-            if kind in (1, 2, 4):
-                colour = WALL if kind == 1 else GOAL
+        for cell, code in enumerate(board.flatten().tolist()):
+            if code in (rules.WALL, rules.GOAL, rules.BOX_ON_GOAL, rules.PLAYER_ON_GOAL):
+                colour = WALL if code == rules.WALL else GOAL
                 parts.append(_rectangle(cell % width * CELL, cell // width * CELL, CELL, colour))
         parts += [_moving(_rectangle(3, 3, CELL - 6, BOX), cells, width) for cells in _boxes(states)]
         player = f'<circle cx="{CELL / 2}" cy="{CELL / 2}" r="{CELL / 3}" fill="{PLAYER}"/>'
-        parts.append(_moving(player, [int(world.mover(state[None])) for state in states], width))
+        parts.append(_moving(player, [_first_cell(state >= rules.PLAYER) for state in states], width))
     size = f'width="{width * CELL}" height="{height * CELL}"'
     title = f"<title>A puzzle solved in {len(moves)} moves</title>"
     return f'<svg xmlns="http://www.w3.org/2000/svg" {size} role="img">{title}{"".join(parts)}</svg>\n'
 
 
+def _first_cell(there: Tensor) -> int:
+    return int(there.flatten().int().argmax())
+
+
 def _boxes(states: list[Tensor]) -> list[list[int]]:
     """The cell of each box in each state."""
-    cells = [((state == 3) | (state == 4)).flatten().nonzero()[:, 0].tolist() for state in states]
+    cells = [
+        ((state == rules.BOX) | (state == rules.BOX_ON_GOAL)).flatten().nonzero()[:, 0].tolist() for state in states
+    ]
     tracks = [[cell] for cell in cells[0]]
     for now in cells[1:]:
         moved = [cell for cell in now if cell not in [track[-1] for track in tracks]]

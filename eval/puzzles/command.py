@@ -15,7 +15,6 @@ from jsonargparse.typing import NonNegativeInt, PositiveInt
 from eval.puzzles.animation import animation
 from eval.puzzles.contest import (
     BOOTSTRAP,
-    LEARNED,
     PLANNERS,
     REROOTED,
     SEARCHES,
@@ -42,7 +41,7 @@ FILES = {
 }
 """Training and test problems by world."""
 
-PriorName = Literal[BOOTSTRAP, REROOTED, *LEARNED, *PLANNERS, *SEARCHES]  # type: ignore[valid-type]
+PriorName = Literal[BOOTSTRAP, REROOTED, *PLANNERS, *SEARCHES]  # type: ignore[valid-type]
 
 
 def puzzles(
@@ -52,7 +51,7 @@ def puzzles(
     test: str | None = None,
     num_test: PositiveInt | None = None,
     budget: PositiveInt = 50_000,
-    priors: Sequence[PriorName] = (BOOTSTRAP, REROOTED, "log-linear", "network", "product", "uniform", "greedy"),
+    priors: Sequence[PriorName] = (BOOTSTRAP, REROOTED, "uniform", "greedy"),
     guided: bool | None = None,
     sweeps: PositiveInt = 8,
     seeds: PositiveInt = 1,
@@ -60,11 +59,10 @@ def puzzles(
     processes: PositiveInt | None = None,
     out: str = "runs/puzzles",
 ) -> None:
-    """Puzzles solved by policy-guided search: which prior needs how many expansions, and how long does it take?
+    """Puzzles solved by policy-guided search: how many expansions does it need with a prior, and without?
 
-    A log-linear prior of patterns solves training problems and learns from its solutions, in several sweeps. Other
-    priors learn from the same solutions, and Levin tree search solves the test problems with each. Interrupted, the
-    same command goes on. Needs numba: pip install 'neuroprior[fast]'.
+    A log-linear prior of patterns solves training problems and learns from its solutions, in several sweeps. Then
+    Levin tree search solves the test problems with it. Interrupted, the same command goes on.
 
     Args:
         world: sokoban or tiles.
@@ -74,10 +72,9 @@ def puzzles(
         num_test: so many of them, the first; all by default.
         budget: expansions for each test problem.
         priors: bootstrap (the log-linear prior after all sweeps); rerooted (the same prior, searched with rerooting);
-            fitted to its solutions: log-linear, network, product and, for 50 problems and 2,000 expansions at most, as
-            they are slow, backoff, markov, board; as slow, with the bootstrapped prior: frontier, mcts (these planners,
-            not Levin tree search); without any learning: uniform, a-star, weighted-a-star (weight 5), greedy,
-            breadth-first.
+            frontier, mcts (these planners with the same prior, not Levin tree search, for 50 problems and 2,000
+            expansions at most, as they are slow); without any learning: uniform, a-star, weighted-a-star (weight 5),
+            greedy, breadth-first.
         guided: search with the heuristic, too (PHS*); by default in tiles alone.
         sweeps: of solving and learning.
         seeds: repeats; each takes the training problems in another order.
@@ -114,7 +111,7 @@ def report(
 ) -> Document:
     """The tables: of all priors, of problems with walls of their own, of pairs of priors, and of the sweeps."""
     each = pd.concat([_per_problem(one) for one in found], ignore_index=True)
-    seconds = pd.DataFrame([{key: one[key] for key in ("prior", "seed", "seconds", "fit_seconds")} for one in found])
+    seconds = pd.DataFrame([{key: one[key] for key in ("prior", "seed", "seconds")} for one in found])
     rows = _rows(each, seconds)
     frames = {"puzzles": rows, "pairs": _pairs(each), "sweeps": pd.DataFrame(sweeps)}
     tables = [_table(rows, "Test problems", settings)]
@@ -124,7 +121,7 @@ def report(
         own = [number for number, layout in enumerate(walls) if layout not in among]
         if 0 < len(own) < len(both[1].boards):
             apart = _rows(each[each["problem"].isin(own)], seconds)
-            frames["own_walls"] = apart = apart.drop(columns=["seconds_per_problem", "fit_seconds"])
+            frames["own_walls"] = apart = apart.drop(columns="seconds_per_problem")
             tables.append(_table(apart, "Test problems whose walls are those of no training problem", settings))
     if len(frames["pairs"]):
         tables.append(_pair_table(frames["pairs"]))
@@ -169,38 +166,25 @@ def _rows(each: pd.DataFrame, seconds: pd.DataFrame) -> pd.DataFrame:
             "mean_length": grouped["length"].mean(),
         }
     ).reindex(each["prior"].unique())
-    times = seconds.groupby("prior")[["seconds", "fit_seconds"]].mean()
-    rows["seconds_per_problem"] = times["seconds"] / rows["problems"]
-    rows["fit_seconds"] = times["fit_seconds"]
+    rows["seconds_per_problem"] = seconds.groupby("prior")["seconds"].mean() / rows["problems"]
     return rows.rename_axis("prior").reset_index()
 
 
 def _pairs(each: pd.DataFrame) -> pd.DataFrame:
-    """Each learned prior against the log-linear one: how many times as many expansions, over problems.
+    """Each of the others against the bootstrapped prior: how many times as many expansions, over problems.
 
     The geometric mean of the ratio; of a problem the mean over seeds; the interval is Student's over problems.
     """
-    logs = each.assign(log=np.log(each["expansions"].clip(lower=1)))
+    logs = each[each["budget"] == each["budget"].max()].assign(
+        log=lambda rows: np.log(rows["expansions"].clip(lower=1))
+    )
     wide = logs.pivot_table(index="problem", columns="prior", values="log", sort=False)
-    if "log-linear" not in wide:
-        return pd.DataFrame()
     rows = []
-    for prior in wide.columns:
-        both = wide[["log-linear", prior]].dropna()
-        comparable = each.loc[each["prior"] == prior, "budget"].iloc[0] == each["budget"].max()
-        if prior != "log-linear" and comparable and len(both) > 1:
-            difference = paired_difference(both[prior], both["log-linear"])
+    for prior in wide.columns if BOOTSTRAP in wide and len(wide) > 1 else ():
+        if prior != BOOTSTRAP:
+            difference = paired_difference(wide[prior], wide[BOOTSTRAP])
             ratio, low, high = (float(np.exp(x)) for x in (difference.mean, difference.low, difference.high))
-            rows.append(
-                {
-                    "prior": prior,
-                    "against": "log-linear",
-                    "problems": len(both),
-                    "ratio": ratio,
-                    "low": low,
-                    "high": high,
-                }
-            )
+            rows.append({"prior": prior, "problems": len(wide), "ratio": ratio, "low": low, "high": high})
     return pd.DataFrame(rows)
 
 
@@ -230,10 +214,10 @@ def _pair_table(pairs: pd.DataFrame) -> Table:
         "times as many expansions": lambda row: f"{row.ratio:.2f} ({row.low:.2f} to {row.high:.2f})",
     }
     caption = (
-        "Expansions in the ratio to those of the log-linear prior that learned from the same solutions: geometric mean"
-        " and 95 % interval (Student's) over problems, of each the mean over seeds."
+        "Expansions in the ratio to those with the bootstrapped prior: geometric mean and 95 % interval (Student's)"
+        " over problems, of each the mean over seeds."
     )
-    return table(pairs, columns, caption, "The same solutions, the same patterns, the same search")
+    return table(pairs, columns, caption, "Against the bootstrapped prior")
 
 
 def _sweep_table(sweeps: pd.DataFrame) -> Table:

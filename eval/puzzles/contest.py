@@ -1,4 +1,4 @@
-"""What is compared: a prior bootstrapped on training problems, others fitted to its solutions, searches without any."""
+"""What is compared: a prior bootstrapped on training problems, and searches without any."""
 
 import time
 from collections.abc import Callable
@@ -12,43 +12,25 @@ import torch
 from torch.nn.functional import pad
 
 from neuroprior.planners import FrontierPlanner, MCTSPlanner, Planner
-from neuroprior.priors import MarkovPrior, Prior, UniformPrior, load
+from neuroprior.priors import UniformPrior, load
 from neuroprior.puzzles import (
     AStarPlanner,
     BestFirstPlanner,
-    BoardNetwork,
     LevinPlanner,
     LogLinearPrior,
-    PatternCounts,
-    PatternNetwork,
     PuzzleWorld,
     Search,
     bootstrap,
     sliding_tiles,
     sokoban,
 )
-from neuroprior.puzzles.bootstrap import fit_solutions, read_solutions
-from neuroprior.puzzles.worlds.puzzle import Observation
-from neuroprior.puzzles.worlds.sokoban import WALL
+from neuroprior.puzzles.worlds.rules import WALL
 
 BOOTSTRAP = "bootstrap"
-"""The log-linear prior that found the solutions, from which all others learn."""
+"""The prior that found the solutions."""
 
 REROOTED = "rerooted"
 """The bootstrapped prior in a search with rerooting."""
-
-BOARD_CHANNELS, BOARD_DEPTH = 32, 2
-"""Of the convolutional network."""
-
-LEARNED: dict[str, Callable[[PuzzleWorld], Prior]] = {
-    "log-linear": lambda world: LogLinearPrior(4, len(world.windows.windows)),
-    "network": lambda world: PatternNetwork(4, len(world.windows.windows)),
-    "product": lambda world: PatternCounts(4, len(world.windows.windows)),
-    "backoff": lambda world: PatternCounts(4, len(world.windows.windows), combine="backoff"),
-    "markov": lambda world: MarkovPrior(4, 2),
-    "board": lambda world: BoardNetwork(4, (world.num_planes, *world.shape), BOARD_CHANNELS, BOARD_DEPTH),
-}
-"""Priors that learn from the solutions: four from the same patterns, one from moves alone, one from the whole board."""
 
 SEARCHES: dict[str, Callable[[PuzzleWorld, int], BestFirstPlanner]] = {
     "uniform": lambda world, budget: LevinPlanner(UniformPrior(4), budget),
@@ -65,14 +47,8 @@ PLANNERS: dict[str, Callable[..., Planner]] = {"frontier": FrontierPlanner, "mct
 PLAN_LENGTH = {"sokoban": 100, "tiles": 300}
 """Moves of their plans: more than nearly all solutions need. As many plans are tried as the budget allows."""
 
-SLOW, SLOW_BUDGET = ("markov", "backoff", "board", *PLANNERS), (50, 2000)
-"""What the compiled search does not know, and problems and expansions at most for these."""
-
-EPOCHS, BOARD_EPOCHS = 12, 3
-"""Passes over the solutions of priors that are trained on them at once; the bootstrapped one had some in each sweep."""
-
-BOARD_ACTIONS = 100_000
-"""Actions that the network on boards learns from, about, with those of reflected and rotated solutions."""
+SLOW_PROBLEMS, SLOW_BUDGET = 50, 2000
+"""Problems and expansions at most for these planners."""
 
 TEACHER = 100_000, 5.0
 """Budget and weight of the weighted A* that solves the first sliding tiles."""
@@ -120,7 +96,7 @@ class Problems(NamedTuple):
     boards: torch.Tensor
 
 
-def problems_of(settings: Settings, observation: Observation = "patterns") -> tuple[Problems, Problems]:
+def problems_of(settings: Settings) -> tuple[Problems, Problems]:
     """The training and the test problems; where Sokoban levels are of two sizes, walls make the smaller ones larger.
 
     Raises:
@@ -128,15 +104,15 @@ def problems_of(settings: Settings, observation: Observation = "patterns") -> tu
         OSError: a file cannot be read.
     """
     make: Callable[..., PuzzleWorld] = sokoban if settings.world == "sokoban" else sliding_tiles
-    worlds = [make(file, observation=observation) for file in (settings.train, settings.test)]
+    worlds = [make(file) for file in (settings.train, settings.test)]
     expected, found = (list(world.shape) for world in worlds)
     if expected != found and settings.world == "sokoban":
         high, wide = map(max, zip(expected, found, strict=True))
         boards = [world.boards for world in worlds if world.boards is not None]
         padded = [pad(some, (0, wide - some.shape[2], 0, high - some.shape[1]), value=WALL) for some in boards]
-        worlds = [sokoban(some, observation=observation) for some in padded]
+        worlds = [sokoban(some) for some in padded]
     elif expected != found:
-        raise ValueError(f"{settings.test}: boards of {expected} are expected, as in {settings.train}, not {found}")
+        raise ValueError(f"{settings.test}: boards must be {expected}, as in {settings.train}, got {found}.")
     numbers = settings.num_train, settings.num_test
     train, test = (
         Problems(world, world.boards[:number])
@@ -166,22 +142,20 @@ def _shuffled(boards: torch.Tensor, settings: Settings, seed: int) -> torch.Tens
 
 
 def contest(settings: Settings, folder: Path, job: Job) -> dict[str, Any]:
-    """Fit a prior to the solutions of its seed, search each test problem with it, and replay what was found.
+    """Search each test problem with the prior of a seed, and replay what was found.
 
     Raises:
         RuntimeError: a solution does not solve its problem, or took more expansions than the bound allows.
     """
-    train, (test, problems) = problems_of(settings, "board" if job.prior == "board" else "patterns")
-    fit_seconds, budget = 0.0, settings.budget
+    _, (test, problems) = problems_of(settings)
+    budget = settings.budget
     planner: Planner
     if job.prior in SEARCHES:
         planner = SEARCHES[job.prior](test, budget)
     else:
-        begin = time.perf_counter()
-        prior = _prior(settings, folder / f"seed-{job.seed}", job, train)
-        fit_seconds = time.perf_counter() - begin
-        if job.prior in SLOW:
-            problems, budget = problems[: SLOW_BUDGET[0]], min(budget, SLOW_BUDGET[1])
+        prior = load(folder / f"seed-{job.seed}" / f"prior-{settings.sweeps}")
+        if job.prior in PLANNERS:
+            problems, budget = problems[:SLOW_PROBLEMS], min(budget, SLOW_BUDGET)
         heuristic = test.lower_bound if settings.guided else None
         planner = LevinPlanner(prior, budget, heuristic=heuristic, reroot=job.prior == REROOTED)
         if job.prior in PLANNERS:
@@ -205,7 +179,6 @@ def contest(settings: Settings, folder: Path, job: Job) -> dict[str, Any]:
     return job._asdict() | {
         "budget": budget,
         "seconds": seconds,
-        "fit_seconds": fit_seconds,
         "expansions": found.expansions.tolist(),
         "log_bound": [bound if np.isfinite(bound) else None for bound in found.log_bound.tolist()],
         "moves": moves,
@@ -227,18 +200,3 @@ def _search(planner: Planner, world: PuzzleWorld, state: torch.Tensor, generator
     lengths = torch.where(solved, reached.int().argmax(1) + 1, reached.shape[1])
     unbounded = torch.full((len(state),), inf, dtype=torch.float64)
     return Search(solved, decision.plan, lengths, decision.score, decision.final_state, steps, unbounded, steps)
-
-
-def _prior(settings: Settings, folder: Path, job: Job, train: Problems) -> Prior:
-    """The bootstrapped prior, or another that learns from its solutions."""
-    solutions = read_solutions(folder)
-    if job.prior in (BOOTSTRAP, REROOTED, *PLANNERS):
-        return load(folder / f"prior-{settings.sweeps}")
-    prior = LEARNED[job.prior](train.world)
-    state = _shuffled(train.boards, settings, job.seed)[torch.tensor(list(solutions))]
-    training: dict[str, Any] = {"epochs": EPOCHS} if "epochs" in prior.fit_settings else {}
-    if job.prior == "board":
-        training = {"epochs": BOARD_EPOCHS, "max_actions": BOARD_ACTIONS}
-    generator = torch.Generator().manual_seed(job.seed)
-    fit_solutions(prior, train.world, state, list(solutions.values()), generator=generator, **training)
-    return prior

@@ -2,10 +2,7 @@
 
 from neuroprior.puzzles.best_first import AStarPlanner, BestFirstPlanner, LevinPlanner, Search
 from neuroprior.puzzles.bootstrap import Sweep, bootstrap
-from neuroprior.puzzles.priors.board import BoardNetwork
-from neuroprior.puzzles.priors.counts import PatternCounts
-from neuroprior.puzzles.priors.log_linear import LogLinearPrior, PatternNetwork
-from neuroprior.puzzles.priors.pattern_prior import PatternPrior, Steps
+from neuroprior.puzzles.priors.log_linear import LogLinearPrior, Steps
 from neuroprior.puzzles.worlds.puzzle import PuzzleWorld
 from neuroprior.puzzles.worlds.reading import format_sokoban, read_sokoban, read_tiles
 from neuroprior.puzzles.worlds.sliding_tiles import SlidingTilesWorld, sliding_tiles, tile_windows
@@ -15,12 +12,8 @@ from neuroprior.puzzles.worlds.windows import Window, Windows, windows_with_move
 __all__ = [
     "AStarPlanner",
     "BestFirstPlanner",
-    "BoardNetwork",
     "LevinPlanner",
     "LogLinearPrior",
-    "PatternCounts",
-    "PatternNetwork",
-    "PatternPrior",
     "PuzzleWorld",
     "SOKOBAN_WINDOWS",
     "Search",

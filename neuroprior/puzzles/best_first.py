@@ -1,19 +1,19 @@
 """Best-first search for a goal, batched over problems: Levin tree search with a prior, A* and its relatives."""
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import inf
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from neuroprior._checks import check_memory, check_sizes, is_number
-from neuroprior._compiled import compiled
 from neuroprior._hashing import row_hashes
 from neuroprior.planners.planner import Decision, Planner, value_of
 from neuroprior.plans import action_dtype
 from neuroprior.priors.uniform import UniformPrior
+from neuroprior.puzzles.compiled_search import ADDITIVE, LEVIN, can_search, compiled_tables, search_all
 from neuroprior.puzzles.worlds.puzzle import PuzzleWorld
 from neuroprior.sampling.draws import check_temperature
 from neuroprior.sampling.stepping import Steppable, Stepper, check_in_world
@@ -31,12 +31,6 @@ BLOCK = 256
 PATH = "edge", "depth", "since", "log_prob", "peak", "least", "gain"
 """What is known of a path to a node before it is expanded."""
 
-TAKEN = "edge", "depth", "gain"
-"""What of it is written to the results."""
-
-EMPTY = -(2**63)
-"""Marks a free place of a hash table."""
-
 
 class Search(NamedTuple):
     """What a search found for B problems.
@@ -49,8 +43,8 @@ class Search(NamedTuple):
         final_state: `[B, ...]`: where the plan ends.
         expansions: int64 `[B]`: nodes that were expanded: those whose actions the prior was asked for.
         log_bound: float64 `[B]`: log(d / pi) of the solution, d its nodes (its actions and 1) and pi the probability of
-            its actions; inf where there is none. With one node at a time, Levin tree search expands at most d / pi.
-            With rerooting: the logarithm of the bound that holds then, see `LevinPlanner`.
+            its actions; inf where there is none. Levin tree search expands at most d / pi nodes. With rerooting: the
+            logarithm of the bound that holds then, see `LevinPlanner`.
         model_steps: int64 `[B]`: single simulator steps.
     """
 
@@ -70,16 +64,16 @@ class BestFirstPlanner(Planner):
     Each state is expanded once (state cuts): a path that reaches a state again is dropped. Children are made when their
     turn comes, so that those which never come cost nothing, unless a heuristic needs their states.
 
+    Sokoban and sliding tiles on the CPU are searched by a compiled loop if the prior is a `LogLinearPrior` or uniform,
+    and the heuristic, if any, the world's `lower_bound`. All other worlds with a goal, priors and heuristics are
+    searched by a batched search in torch, which steps the world and the prior: the same order of expansion, but tens
+    of times as slow.
+
     Args:
         prior: its probabilities are those of the actions at a node; None: uniform.
         max_nodes: nodes that are expanded for each problem, at most; bounds time and memory.
         heuristic: the number of steps left from each state; None: none is known.
-        nodes_at_once: nodes that are expanded together for each problem. Above 1 the world and the prior are asked
-            for more at once, and up to so many times more nodes are expanded.
         temperature: divides the prior's logits.
-        compile: search by a compiled loop where numba is installed and it knows the world, the prior and the heuristic
-            (puzzles on the CPU, uniform priors and those of patterns, `lower_bound`): it finds the same, tens of
-            times as fast.
 
     Raises:
         ValueError: an argument is out of range. `plan` and `search` raise it for a stochastic world, a world without
@@ -89,8 +83,8 @@ class BestFirstPlanner(Planner):
 
     steps_at_once = 2**20
 
-    order: tuple[int, float] = (0, 1.0)
-    """For the compiled loop, 0 for d / pi, 1 for depth + weight * heuristic; and the weight."""
+    order: tuple[int, float] | None = None
+    """For the compiled loop, the kind of order and the weight of the heuristic; None: it does not know `cost`."""
 
     reroot = False
     """Whether nodes nearer to the goal than all before them on their path are new roots, see `LevinPlanner`."""
@@ -101,20 +95,15 @@ class BestFirstPlanner(Planner):
         max_nodes: int = 10_000,
         *,
         heuristic: Heuristic | None = None,
-        nodes_at_once: int = 1,
         temperature: float = 1.0,
-        compile: bool = True,
     ) -> None:
         super().__init__("return")
-        check_sizes(max_nodes=max_nodes, nodes_at_once=nodes_at_once)
+        check_sizes(max_nodes=max_nodes)
         check_memory(8 * max_nodes, max_nodes=max_nodes)
         check_temperature(temperature)
         if prior is not None and not isinstance(prior, Steppable):
-            raise ValueError(f"prior: a prior with num_actions, start and step is expected, not {type(prior).__name__}")
-        if heuristic is not None and not callable(heuristic):
-            raise ValueError(f"heuristic: a function of states is expected, not {heuristic!r}")
-        self.prior, self.max_nodes, self.heuristic = prior, max_nodes, heuristic
-        self.nodes_at_once, self.temperature, self.compile = nodes_at_once, temperature, compile
+            raise ValueError(f"`prior` must have num_actions, start and step, got {type(prior).__name__}.")
+        self.prior, self.max_nodes, self.heuristic, self.temperature = prior, max_nodes, heuristic, temperature
 
     @abstractmethod
     def cost(self, depth: Tensor, log_prob: Tensor, left: Tensor) -> Tensor:
@@ -147,56 +136,44 @@ class BestFirstPlanner(Planner):
         Raises:
             ValueError: see the class.
         """
+        kind = type(world).__name__
         if world.stochastic:
-            raise ValueError("world: a deterministic one is expected: a search reaches each state by the same actions")
+            raise ValueError(f"`world` must be deterministic, got a stochastic {kind}.")
         if not world.has_goal:
-            kind = type(world).__name__
-            raise ValueError(
-                f"world: one with goals (has_goal is True, and `solved` says where) is expected, not {kind}"
-            )
+            raise ValueError(f"`world` must have goals (has_goal, and `solved` says where), got {kind}.")
         if self.reroot and not hasattr(world, "lower_bound"):
-            kind = type(world).__name__
-            raise ValueError(f"reroot: a world with lower_bound(state), the steps left, is expected, not {kind}")
+            raise ValueError(f"`reroot` must be False where the world has no lower_bound(state), got {kind}.")
         prior = UniformPrior(world.num_actions).to(state.device) if self.prior is None else self.prior
         check_in_world(prior, world, state)
         if isinstance(of := getattr(self.heuristic, "__self__", None), World) and of is not world:
             try:
                 of.check_state(state)
             except ValueError as error:
-                raise ValueError(f"heuristic: it is that of another world ({error})") from None
-        if (module := self._compiled(world, prior)) is not None:
+                raise ValueError(f"`heuristic` must know the states of this world: {error}") from None
+        bounded = self.heuristic is None or self.heuristic == getattr(world, "lower_bound", None)
+        if self.order is not None and bounded and can_search(world, prior):
             assert isinstance(world, PuzzleWorld)
-            return self._search_compiled(module, world, prior, state)
+            return self._search_compiled(world, prior, self.order, state)
         parts = [self._search(world, prior, some) for some in self.chunks(state, self.max_nodes)]
         longest = max(part.plan.shape[1] for part in parts)
         plans = [torch.nn.functional.pad(part.plan, (0, longest - part.plan.shape[1])) for part in parts]
         joined = [torch.cat(values) for values in zip(*parts, strict=True) if values[0] is not parts[0].plan]
         return Search(joined[0], torch.cat(plans), *joined[1:])
 
-    def _compiled(self, world: World, prior: Steppable) -> Any:
-        """The module of the compiled loop where it can do this search in the same way, else None."""
-        informed = self.heuristic is not None and self.heuristic != getattr(world, "lower_bound", None)
-        if not self.compile or informed or self.nodes_at_once > 1 or self.temperature != 1:
-            return None
-        module = compiled("neuroprior.puzzles.compiled_search") if isinstance(world, PuzzleWorld) else None
-        return module if module is not None and module.can_search(world, prior) else None
-
-    def _search_compiled(self, module: Any, world: PuzzleWorld, prior: Steppable, state: Tensor) -> Search:
-        informed = self.heuristic is not None
-        found = module.search_all(world, prior, state, *self.order, informed, self.reroot, self.max_nodes)
-        lengths = torch.tensor([len(plan) for plan in found.plans], dtype=torch.long)
-        plans = [torch.from_numpy(plan) for plan in found.plans]
-        padded = torch.nn.utils.rnn.pad_sequence(plans, batch_first=True) if plans else torch.zeros(0, 0)
-        final, score = _followed(world, state, padded, lengths)
-        numbers = (torch.from_numpy(x) for x in (found.expansions, found.log_bound, found.model_steps))
-        plan = padded.to(action_dtype(world.num_actions))
-        return Search(torch.from_numpy(found.solved), plan, lengths, score, final, *numbers)
+    def _search_compiled(self, world: PuzzleWorld, prior: Steppable, order: tuple[int, float], state: Tensor) -> Search:
+        tables, informed = compiled_tables(prior, self.temperature), self.heuristic is not None
+        solved, paths, *numbers = search_all(world, tables, state, order, informed, self.reroot, self.max_nodes)
+        lengths = torch.tensor([len(path) for path in paths], dtype=torch.long)
+        plan = pad_plans([torch.from_numpy(path) for path in paths], world.num_actions)
+        final, score = follow_plans(world, state, plan, lengths)
+        log_bound, expansions, steps = (torch.from_numpy(values) for values in numbers)
+        return Search(torch.from_numpy(solved), plan, lengths, score, final, expansions, log_bound, steps)
 
     def _search(self, world: World, prior: Steppable, state: Tensor) -> Search:
         trees = _Trees(self, world, _stepper(prior, world, state), state)
-        while trees.active:
+        while len(trees.rows):
             trees.expand_best()
-        return trees.found()
+        return trees.result._replace(plan=pad_plans(trees.paths, world.num_actions))
 
 
 class LevinPlanner(BestFirstPlanner):
@@ -220,7 +197,7 @@ class LevinPlanner(BestFirstPlanner):
 
     Args:
         reroot: whether there are such roots. The world needs `lower_bound(state)`, as `SokobanWorld` has it.
-        prior, max_nodes, heuristic, nodes_at_once, temperature, compile: see `BestFirstPlanner`.
+        prior, max_nodes, heuristic, temperature: see `BestFirstPlanner`.
 
     Raises:
         ValueError: see `BestFirstPlanner`; and `search` raises it where `reroot` finds no `world.lower_bound`.
@@ -232,6 +209,8 @@ class LevinPlanner(BestFirstPlanner):
         True
     """
 
+    order = (LEVIN, 1.0)
+
     def __init__(
         self,
         prior: Steppable,
@@ -239,12 +218,9 @@ class LevinPlanner(BestFirstPlanner):
         *,
         heuristic: Heuristic | None = None,
         reroot: bool = False,
-        nodes_at_once: int = 1,
         temperature: float = 1.0,
-        compile: bool = True,
     ) -> None:
-        how: dict[str, Any] = {"nodes_at_once": nodes_at_once, "temperature": temperature, "compile": compile}
-        super().__init__(prior, max_nodes, heuristic=heuristic, **how)
+        super().__init__(prior, max_nodes, heuristic=heuristic, temperature=temperature)
         self.reroot = reroot
 
     def cost(self, depth: Tensor, log_prob: Tensor, left: Tensor) -> Tensor:
@@ -259,7 +235,7 @@ class AStarPlanner(BestFirstPlanner):
         heuristic: the steps that are left; None: breadth-first search.
         weight: of the heuristic: 1: A*, whose plans are shortest where the heuristic is consistent; above 1: weighted
             A*; inf: greedy best-first search.
-        max_nodes, nodes_at_once, compile: see `BestFirstPlanner`.
+        max_nodes: see `BestFirstPlanner`.
 
     Raises:
         ValueError: an argument is out of range.
@@ -271,19 +247,11 @@ class AStarPlanner(BestFirstPlanner):
         True
     """
 
-    def __init__(
-        self,
-        heuristic: Heuristic | None = None,
-        weight: float = 1.0,
-        max_nodes: int = 10_000,
-        *,
-        nodes_at_once: int = 1,
-        compile: bool = True,
-    ) -> None:
-        super().__init__(None, max_nodes, heuristic=heuristic, nodes_at_once=nodes_at_once, compile=compile)
+    def __init__(self, heuristic: Heuristic | None = None, weight: float = 1.0, max_nodes: int = 10_000) -> None:
+        super().__init__(None, max_nodes, heuristic=heuristic)
         if not is_number(weight) or not weight >= 0:
-            raise ValueError(f"weight: a number of at least 0 is expected, not {weight!r}")
-        self.weight, self.order = weight, (1, float(weight))
+            raise ValueError(f"`weight` must be at least 0, got {weight!r}.")
+        self.weight, self.order = weight, (ADDITIVE, float(weight))
 
     def cost(self, depth: Tensor, log_prob: Tensor, left: Tensor) -> Tensor:
         return left.double() if self.weight == inf else depth + self.weight * left.double()
@@ -303,100 +271,78 @@ class _Trees:
         self.lower_bound: Heuristic | None = getattr(world, "lower_bound", None) if planner.reroot else None
         batch, device = len(state), state.device
         self.rows = torch.arange(batch, device=device)
-        self.size = torch.zeros(batch, dtype=torch.long, device=device)
+        self.size, self.steps = torch.zeros_like(self.rows), torch.zeros_like(self.rows)
         self.capacity = min(FIRST_NODES, planner.max_nodes)
-        self.steps = torch.zeros(batch, dtype=torch.long, device=device)
-        self.paths: list[Tensor] = [torch.empty(0, dtype=torch.long, device=device)] * batch
-        empty = torch.zeros(batch, dtype=torch.long, device=device)
+        self.paths: list[Tensor] = [self.rows[:0]] * batch
+        self.seen = [{code} for code in row_hashes(state).tolist()]
+        empty, nothing = torch.zeros_like(self.rows), torch.zeros(batch, dtype=torch.float64, device=device)
         self.result = Search(
-            world.solved(state), empty[:, None], empty, empty.double(), state.clone(), empty.clone(),
-            torch.full((batch,), inf, dtype=torch.float64, device=device), empty.clone(),
+            world.solved(state), empty[:, None], empty, nothing, state.clone(), empty.clone(), nothing + inf,
+            empty.clone(),
         )  # fmt: skip
         self.result.log_bound[self.result.solved] = 0.0
         logits, hidden = stepper.start_in(world, state)
-        self.queue = self.minima = torch.zeros(0, 0, dtype=torch.float64, device=device)
-        self.seen = torch.zeros(0, 0, dtype=torch.long, device=device)
+        room = torch.zeros(batch, self.capacity, dtype=torch.float64, device=device)
         self.nodes = {
-            "edge": torch.full((batch, self.capacity), -1, device=device),
-            **{name: torch.zeros(batch, self.capacity, dtype=torch.long, device=device) for name in ("depth", "since")},
-            **{
-                name: torch.zeros(batch, self.capacity, dtype=torch.float64, device=device)
-                for name in ("log_prob", "peak", "least", "gain", "left")
-            },
+            **{name: torch.zeros_like(room, dtype=torch.long) for name in ("edge", "depth", "since")},
+            **{name: torch.zeros_like(room) for name in ("log_prob", "peak", "least", "gain", "left")},
             "state": state.new_zeros(batch, self.capacity, *state.shape[1:]),
             "hidden": hidden.new_zeros(batch, self.capacity, *hidden.shape[1:]),
-            "action_log_prob": torch.zeros(batch, self.capacity, self.actions, dtype=torch.float64, device=device),
+            "action_log_prob": room.new_zeros(batch, self.capacity, self.actions),
         }
-        self._make_room(batch)
-        every = torch.arange(batch, device=device)
-        self._insert(every, row_hashes(state))
+        self._make_queue(batch)
         path = {name: self.nodes[name][:, 0].clone() for name in PATH}
-        path |= {"edge": torch.full_like(every, -1), "least": torch.full_like(path["peak"], inf)}
-        self._add(every, path, state, logits, hidden)
+        path["edge"] -= 1
+        path["least"] += inf
+        self._add(self.rows, path, state, logits, hidden)
         self.size[self.result.solved] = 0
-        self._drop(self.result.solved | (self.size >= planner.max_nodes) | (self.minima.amin(1) == inf))
-
-    @property
-    def active(self) -> bool:
-        """Whether a problem is still searched for."""
-        return len(self.rows) > 0
-
-    def found(self) -> Search:
-        """The results, once every search has ended."""
-        plans = torch.nn.utils.rnn.pad_sequence(self.paths, batch_first=True) if self.paths else self.result.plan[:, :0]
-        return self.result._replace(plan=plans.to(action_dtype(self.actions)))
+        self._drop(self.result.solved)
 
     def expand_best(self) -> None:
-        """Expand the best nodes of each tree."""
-        tree, edge = self._popped()
+        """Expand the best node of each tree."""
+        tree, node = torch.arange(len(self.rows), device=self.rows.device), self.nodes
+        edge = self._pop_edges(tree)
         parent, action = edge.div(self.actions, rounding_mode="floor"), edge % self.actions
-        node = self.nodes
         state, reward = self.world.step(node["state"][tree, parent], action)
-        self.steps.index_add_(0, tree, torch.ones_like(tree))
+        self.steps += 1
         path = {name: node[name][tree, parent] for name in PATH} | {"edge": edge}
         path["depth"] += 1
         path["since"] += 1
         path["log_prob"] += node["action_log_prob"][tree, parent, action]
         path["peak"] = path["peak"].maximum((path["since"].double() + 1).log() - path["log_prob"])
         path["gain"] += reward.double()
-        new = self._insert(tree, row_hashes(state))
+        codes = row_hashes(state).tolist()
+        new = torch.tensor([code not in seen for code, seen in zip(codes, self.seen, strict=True)], device=tree.device)
+        for code, seen in zip(codes, self.seen, strict=True):
+            seen.add(code)
         solved = new & self.world.solved(state)
-        over = self._finish(tree[solved], {name: x[solved] for name, x in path.items()}, state[solved])
-        # Of trees that reached their goal, and beyond the budget, nothing more is expanded.
-        wanted = new & ~over[tree]
-        rank = _rank(tree, wanted)
-        wanted &= self.size[tree] + rank < self.planner.max_nodes
-        tree, state, action, parent = (x[wanted] for x in (tree, state, action, parent))
-        if len(tree):
-            hidden = node["hidden"][tree, parent]
-            logits, hidden = self.stepper.step_in(self.world, action, hidden, state)
-            self._add(tree, {name: x[wanted] for name, x in path.items()}, state, logits, hidden)
-        self._drop(over | (self.size >= self.planner.max_nodes) | (self.minima.amin(1) == inf))
+        self._finish(tree[solved], {name: values[solved] for name, values in path.items()}, state[solved])
+        wanted = new & ~solved
+        if bool(wanted.any()):
+            hidden = node["hidden"][tree, parent][wanted]
+            logits, hidden = self.stepper.step_in(self.world, action[wanted], hidden, state[wanted])
+            path = {name: values[wanted] for name, values in path.items()}
+            self._add(tree[wanted], path, state[wanted], logits, hidden)
+        self._drop(solved)
 
-    def _popped(self) -> tuple[Tensor, Tensor]:
-        """The trees `[M]` and edges `[M]` of the lowest costs, taken out of the queue, the best of each tree first."""
-        trees, edges = [], []
-        every = torch.arange(len(self.rows), device=self.rows.device)
-        blocks = self.queue.view(len(self.rows), -1, BLOCK)
-        for _ in range(self.planner.nodes_at_once):
-            block = self.minima.argmin(1)
-            within = blocks[every, block].argmin(1)
-            there = blocks[every, block, within] < inf
-            trees.append(every[there])
-            edges.append((block * BLOCK + within)[there])
-            blocks[every, block, within] = inf
-            self.minima[every, block] = blocks[every, block].amin(1)
-        return torch.cat(trees), torch.cat(edges)
+    def _pop_edges(self, tree: Tensor) -> Tensor:
+        """The edge of the lowest cost of each tree, int64 `[R]`, taken out of its queue."""
+        blocks = self.queue.view(len(tree), -1, BLOCK)
+        block = self.minima.argmin(1)
+        within = blocks[tree, block].argmin(1)
+        blocks[tree, block, within] = inf
+        self.minima[tree, block] = blocks[tree, block].amin(1)
+        return block * BLOCK + within
 
     def _add(self, tree: Tensor, path: dict[str, Tensor], state: Tensor, logits: Tensor, hidden: Tensor) -> None:
-        """Expand new nodes `[M]` with what is known of their `path`: enter them, and their edges into the queue."""
-        at = self.size[tree] + _rank(tree, torch.ones_like(tree, dtype=torch.bool))
-        self.size.index_add_(0, tree, torch.ones_like(tree))
-        while bool((self.size > self.capacity).any()):
+        """Expand a new node of each of the trees `[M]`, with what is known of its `path`, and queue its edges."""
+        at = self.size[tree]
+        self.size[tree] += 1
+        if bool((self.size > self.capacity).any()):
             self._grow()
         own = torch.log_softmax(logits.double() / self.planner.temperature, -1)
         if bool(own.isnan().any()):
-            raise ValueError("prior: its logits are NaN")
+            raise ValueError("`prior` must have logits that are numbers, got NaN.")
         legal = self.world.legal_actions(state) & ~self.world.terminated(state)[:, None]
         left, of_children = self._left(tree, state, legal)
         if self.lower_bound is not None:
@@ -410,87 +356,49 @@ class _Trees:
             self.nodes[name][tree, at] = values
         depth = (path["since"] + 1)[:, None].expand_as(own)
         cost = self.planner.cost(depth, path["log_prob"][:, None] + own, of_children)
+        cost = cost.masked_fill(~legal | cost.isnan(), inf)
         edges = at[:, None] * self.actions + torch.arange(self.actions, device=at.device)
-        self.queue[tree[:, None], edges] = cost.masked_fill(~legal | cost.isnan(), inf)
+        self.queue[tree[:, None], edges] = cost
         block = edges.div(BLOCK, rounding_mode="floor")
-        shape = len(self.rows), self.minima.shape[1]
-        flat = (tree[:, None] * shape[1] + block).flatten()
-        least = self.queue[tree[:, None], edges].flatten()
-        self.minima = self.minima.flatten().scatter_reduce(0, flat, least, "amin").view(shape)
+        flat = (tree[:, None] * self.minima.shape[1] + block).flatten()
+        self.minima.view(-1).scatter_reduce_(0, flat, cost.flatten(), "amin")
 
     def _left(self, tree: Tensor, state: Tensor, legal: Tensor) -> tuple[Tensor, Tensor]:
-        """What the heuristic says of nodes `[M]`, and of their children `[M, A]`."""
-        heuristic = self.planner.heuristic
+        """What the heuristic says of nodes `[M]`, and of their children `[M, A]`; 0 without one."""
+        heuristic, children = self.planner.heuristic, torch.zeros_like(legal, dtype=torch.float64)
         if heuristic is None:
-            return torch.zeros(len(state), dtype=torch.float64, device=state.device), torch.zeros(
-                legal.shape, dtype=torch.float64, device=state.device
-            )
+            return children[:, 0], children
         where, action = legal.nonzero(as_tuple=True)
         reached, _ = self.world.step(state[where], action)
-        self.steps.index_add_(0, tree[where], torch.ones_like(where))
-        children = torch.zeros(legal.shape, dtype=torch.float64, device=state.device)
+        self.steps[tree] += legal.sum(1)
         children[where, action] = value_of(heuristic, reached, "heuristic").double()
         if bool((children < 0).any()):
-            raise ValueError("heuristic: numbers of at least 0, of steps that are left, are expected")
+            raise ValueError(f"`heuristic` must be at least 0, got {float(children.min())}.")
         return value_of(heuristic, state, "heuristic").double(), children
 
-    def _insert(self, tree: Tensor, hashes: Tensor) -> Tensor:
-        """Enter states, by their `hashes [M]`, into the hash tables: which of them are new, bool `[M]`.
-
-        Of equal ones the first is new.
-        """
-        places = self.seen.shape[1]
-        place, new = hashes & (places - 1), torch.zeros_like(hashes, dtype=torch.bool)
-        left = torch.arange(len(hashes), device=hashes.device)
-        table = self.seen.view(-1)
-        while len(left):
-            flat = tree[left] * places + place[left]
-            there = table[flat]
-            free = there == EMPTY
-            claims = left[free]
-            slots, which = flat[free].unique(return_inverse=True)
-            first = torch.full_like(slots, len(hashes)).scatter_reduce(0, which, claims, "amin")
-            table[slots] = hashes[first]
-            new[first] = True
-            place[left[~free]] += 1
-            place &= places - 1
-            left = left[~new[left] & (there != hashes[left])]
-        return new
-
-    def _make_room(self, trees: int) -> None:
-        """A queue and hash tables for `capacity` nodes a tree."""
-        device, edges = self.rows.device, self.capacity * self.actions
-        blocks = -(-edges // BLOCK)
-        self.queue = torch.full((trees, blocks * BLOCK), inf, dtype=torch.float64, device=device)
-        self.minima = torch.full((trees, blocks), inf, dtype=torch.float64, device=device)
-        places = 2 ** (4 * self.capacity + self.planner.nodes_at_once).bit_length()
-        self.seen = torch.full((trees, places), EMPTY, device=device)
+    def _make_queue(self, trees: int) -> None:
+        """A queue for the edges of `capacity` nodes a tree."""
+        blocks = -(-self.capacity * self.actions // BLOCK)
+        self.queue = torch.full((trees, blocks * BLOCK), inf, dtype=torch.float64, device=self.rows.device)
+        self.minima = self.queue.new_full((trees, blocks), inf)
 
     def _grow(self) -> None:
         """Twice the room for nodes."""
-        trees, old, queue, minima, seen = len(self.rows), self.capacity, self.queue, self.minima, self.seen
-        self.capacity *= 2
-        self._make_room(trees)
-        self.queue[:, : queue.shape[1]], self.minima[:, : minima.shape[1]] = queue, minima
-        tree, place = (seen != EMPTY).nonzero(as_tuple=True)
-        self._insert(tree, seen[tree, place])
+        queue, minima, trees = self.queue, self.minima, len(self.rows)
         for name, values in self.nodes.items():
-            more = values.new_zeros(trees, self.capacity - old, *values.shape[2:])
-            self.nodes[name] = torch.cat([values, more], 1)
+            self.nodes[name] = torch.cat([values, torch.zeros_like(values)], 1)
+        self.capacity *= 2
+        self._make_queue(trees)
+        self.queue[:, : queue.shape[1]], self.minima[:, : minima.shape[1]] = queue, minima
 
-    def _finish(self, tree: Tensor, path: dict[str, Tensor], state: Tensor) -> Tensor:
-        """Take the first solution of each tree; which trees have one, bool `[R]`."""
-        over = torch.zeros(len(self.rows), dtype=torch.bool, device=tree.device)
-        first = _rank(tree, torch.ones_like(tree, dtype=torch.bool)) == 0
-        tree, edge, depth, gain, state = (x[first] for x in (tree, *(path[name] for name in TAKEN), state))
-        over[tree] = True
+    def _finish(self, tree: Tensor, path: dict[str, Tensor], state: Tensor) -> None:
+        """Take the solutions of trees `[M]`."""
         row, found = self.rows[tree], self.result
         found.solved[row] = True
         entered = torch.arange(self.capacity, device=tree.device) < self.size[tree][:, None]
         roots = ((self.nodes["since"][tree] == 0) & entered).sum(1)
-        found.log_bound[row] = roots.double().log() + path["peak"][first]
-        self._take(tree, edge, depth, gain, state)
-        return over
+        found.log_bound[row] = roots.double().log() + path["peak"]
+        self._take(tree, path["edge"], path["depth"], path["gain"], state)
 
     def _take(self, tree: Tensor, edge: Tensor, depth: Tensor, gain: Tensor, state: Tensor) -> None:
         """Write the paths `[M]` that end with `edge` to the results."""
@@ -506,23 +414,24 @@ class _Trees:
         for one, number, path in zip(row.tolist(), depth.tolist(), plan, strict=True):
             self.paths[one] = path[:number]
 
-    def _drop(self, over: Tensor) -> None:
-        """Leave the trees that are `over`, bool `[R]`; those without a solution with their best node."""
+    def _drop(self, solved: Tensor) -> None:
+        """Leave the trees that are `solved`, bool `[R]`, and, with their best nodes, those that end unsolved."""
+        over = solved | (self.size >= self.planner.max_nodes) | (self.minima.amin(1) == inf)
         if not bool(over.any()):
             return
-        ended = over.nonzero()[:, 0]
+        ended, lost = over.nonzero()[:, 0], (over & ~solved).nonzero()[:, 0]
         row = self.rows[ended]
         self.result.expansions[row], self.result.model_steps[row] = self.size[ended], self.steps[ended]
-        lost = ended[~self.result.solved[row]]
         if len(lost):
             beyond = torch.arange(self.capacity, device=lost.device) >= self.size[lost][:, None]
             gain = self.nodes["gain"][lost].masked_fill(beyond, -inf)
             left = self.nodes["left"][lost].masked_fill(gain < gain.amax(1, keepdim=True), inf)
             best = left.argmin(1)
-            self._take(lost, *(self.nodes[name][lost, best] for name in (*TAKEN, "state")))
+            self._take(lost, *(self.nodes[name][lost, best] for name in ("edge", "depth", "gain", "state")))
         kept = (~over).nonzero()[:, 0]
         self.rows, self.size, self.steps = self.rows[kept], self.size[kept], self.steps[kept]
-        self.queue, self.minima, self.seen = self.queue[kept], self.minima[kept], self.seen[kept]
+        self.queue, self.minima = self.queue[kept], self.minima[kept]
+        self.seen = [self.seen[k] for k in kept.tolist()]
         self.nodes = {name: values[kept] for name, values in self.nodes.items()}
 
 
@@ -580,26 +489,18 @@ def _stepper(prior: Steppable, world: World, state: Tensor) -> Stepper:
     return stepper if after.shape == before.shape else _ByDepth(prior)
 
 
-def _rank(tree: Tensor, counted: Tensor) -> Tensor:
-    """How many earlier entries of each entry's tree are counted, `[M]`."""
-    order = tree.argsort(stable=True)
-    ones = counted[order].long()
-    before = ones.cumsum(0) - ones
-    sorted_tree = tree[order]
-    starts = torch.ones_like(sorted_tree, dtype=torch.bool)
-    starts[1:] = sorted_tree[1:] != sorted_tree[:-1]
-    base = before[starts][starts.long().cumsum(0) - 1] if len(tree) else before
-    rank = torch.empty_like(before)
-    rank[order] = before - base
-    return rank
+def pad_plans(plans: Sequence[Tensor], num_actions: int) -> Tensor:
+    """Plans of different lengths as one tensor `[N, L]`, with 0 beyond their ends."""
+    if not plans:
+        return torch.zeros(0, 0, dtype=action_dtype(num_actions))
+    return torch.nn.utils.rnn.pad_sequence(list(plans), batch_first=True).to(action_dtype(num_actions))
 
 
-def _followed(world: World, state: Tensor, plans: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
+def follow_plans(world: World, state: Tensor, plans: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
     """Where plans `[B, L]` end, and the sum of their rewards, float64 `[B]`."""
-    score = torch.zeros(len(state), dtype=torch.float64, device=state.device)
+    state, score = state.clone(), torch.zeros(len(state), dtype=torch.float64, device=state.device)
     for t in range(plans.shape[1]):
         on = lengths > t
-        state = state.clone()
         state[on], reward = world.step(state[on], plans[on, t].long())
         score[on] += reward.double()
     return state, score

@@ -16,13 +16,12 @@ from torch import Tensor
 from neuroprior._checks import check_flags, check_sizes, kind_of
 from neuroprior._files import read_json, write_json, written_whole
 from neuroprior._random import generator_on
-from neuroprior.plans import Plans, action_dtype
+from neuroprior.plans import Plans
 from neuroprior.plans.sequences import Sequences, plans_digest
 from neuroprior.priors import Prior, load, save
 from neuroprior.priors.prior import check_is_prior
-from neuroprior.priors.serialization import written_state
-from neuroprior.puzzles.best_first import BestFirstPlanner, Heuristic, LevinPlanner, Search
-from neuroprior.puzzles.priors.pattern_prior import PatternPrior, Steps
+from neuroprior.puzzles.best_first import BestFirstPlanner, LevinPlanner, Search, follow_plans, pad_plans
+from neuroprior.puzzles.priors.log_linear import LogLinearPrior, Steps
 from neuroprior.puzzles.worlds.puzzle import PuzzleWorld
 from neuroprior.sampling.stepping import Stepper
 from neuroprior.worlds.world import World, check_is_world
@@ -32,9 +31,6 @@ ENOUGH = 0.75
 
 MORE = 4
 """Factor by which the number of problems rises then."""
-
-WALKS, WALK = 64, 32
-"""Problems and random actions by which the world of a folder is recognised."""
 
 NEW = 0.25
 """Where less than this share of the solutions is new, the budget doubles."""
@@ -126,12 +122,12 @@ def bootstrap(
     check_is_world(world)
     check_is_prior(prior)
     if not isinstance(teacher, BestFirstPlanner | None):
-        raise ValueError(f"teacher: a BestFirstPlanner, such as AStarPlanner(), is expected, not {kind_of(teacher)}")
+        raise ValueError(f"`teacher` must be a BestFirstPlanner, such as AStarPlanner(), got {kind_of(teacher)}.")
     world.check_state(problems)
     if len(problems) == 0:
-        raise ValueError("problems: at least one is expected")
+        raise ValueError("`problems` must hold at least one problem, got none.")
     if guided and not hasattr(world, "lower_bound"):
-        raise ValueError(f"guided: a world with a lower_bound is expected, not {type(world).__name__}")
+        raise ValueError(f"`guided` must be False where the world has no lower_bound, got {type(world).__name__}.")
     prior.check_settings(settings)
     Stepper(prior).start_in(world, problems[:1])  # a teacher would ask it for nothing before it has searched
     generator = generator_on(generator, "cpu")
@@ -143,16 +139,13 @@ def bootstrap(
         "guided": guided,
         "digest": digest,
         "max_actions": max_actions,
-    }
-    if folder is not None:
-        walked = _walked(world, problems[:WALKS])
-        asked["teacher"] = teacher and _described(teacher, world, walked, prior)
-        heuristic = world.lower_bound if guided else None  # type: ignore[attr-defined]
-        asked["world"] = [type(world).__name__, _digest(world, walked, heuristic)]
-    asked["settings"] = {
-        name: plans_digest(value) if isinstance(value, Sequences) else repr(value)
-        for name, value in sorted(settings.items())
-        if name != "progress"
+        "world": type(world).__name__,
+        "teacher": None if teacher is None else _describe(teacher),
+        "settings": {
+            name: plans_digest(value) if isinstance(value, Sequences) else repr(value)
+            for name, value in sorted(settings.items())
+            if name != "progress"
+        },
     }
     run = _Bootstrap(world, prior, problems, asked, None if folder is None else Path(folder), generator, sweeps)
     yield from run.done
@@ -166,7 +159,7 @@ def bootstrap(
         found = planner.search(world, problems[:tried])
         run.take(found)
         searched = time.perf_counter()
-        actions = run.learn(max_actions, settings) if run.plans else 0
+        actions = run.learn(max_actions, settings)
         seconds = searched - begin, time.perf_counter() - searched
         share, mean = float(found.solved.double().mean()), float(found.expansions.double().mean())
         run.end(Sweep(len(run.done) + 1, tried, planner.max_nodes, share, len(run.plans), mean, actions, *seconds))
@@ -174,48 +167,16 @@ def bootstrap(
     if not run.plans:
         last = run.done[-1]
         raise ValueError(
-            f"problems: none of {last.problems} was solved within {last.max_nodes} expansions; give a larger max_nodes,"
-            " more sweeps, a teacher or easier problems"
+            f"`max_nodes` must be enough to solve some of {last.problems} problems, got none that {last.max_nodes}"
+            " expansions solve. Give a larger max_nodes, more sweeps, a teacher or easier problems."
         )
 
 
-def _walked(world: World, state: Tensor) -> list[Tensor]:
-    """The states of `state [N, ...]`, and after each of `WALK` random legal actions, always the same ones.
-
-    A walk stays where the episode ends, or no action is legal.
-    """
-    generator, found = torch.Generator().manual_seed(0), [state]
-    for _ in range(WALK):
-        now = found[-1].clone()
-        legal = world.legal_actions(now) & ~world.terminated(now)[:, None]
-        going = legal.any(1)
-        weights = (legal | ~going[:, None]).cpu().double()
-        action = weights.multinomial(1, generator=generator)[:, 0].to(state.device)
-        if going.any():
-            now[going] = world.step(now[going], action[going])[0]
-        found.append(now)
-    return found
-
-
-def _digest(world: World, walked: list[Tensor], heuristic: Heuristic | None) -> str:
-    """Of the states on walks, of where goals are among them, and of a heuristic there."""
-    given, hashed = torch.cat(walked), sha256()
-    shown = [given, world.solved(given), world.terminated(given)]
-    for values in shown if heuristic is None else [*shown, heuristic(given)]:
-        rounded = (values.double() * 1e4).round().long() if values.is_floating_point() else values.long()
-        hashed.update(rounded.cpu().contiguous().numpy().tobytes())
-    return hashed.hexdigest()
-
-
-def _described(teacher: BestFirstPlanner, world: World, walked: list[Tensor], prior: Prior) -> dict[str, Any]:
-    """What distinguishes a teacher: its class and settings, its prior, and its heuristic in some states."""
-    own = [type(teacher.prior).__name__]
-    if teacher.prior is not prior and isinstance(teacher.prior, Prior):
-        own.append(sha256(repr(teacher.prior.config).encode() + written_state(teacher.prior)).hexdigest())
-    plain = {name: one for name, one in vars(teacher).items() if isinstance(one, bool | int | float | str)}
-    kind, heuristic = type(teacher).__name__, teacher.heuristic
-    about = {"class": kind, "prior": own}
-    return plain | about | {"heuristic": heuristic and _digest(world, walked, heuristic)}
+def _describe(teacher: BestFirstPlanner) -> dict[str, Any]:
+    """The class of a teacher, the class of its prior, whether it has a heuristic, and its numbers."""
+    about = {"class": type(teacher).__name__, "prior": type(teacher.prior).__name__}
+    numbers = {name: value for name, value in vars(teacher).items() if isinstance(value, bool | int | float)}
+    return about | {"informed": teacher.heuristic is not None} | numbers
 
 
 class _Bootstrap:
@@ -255,11 +216,26 @@ class _Bootstrap:
             self.plans[number] = found.plan[number, : int(found.lengths[number])].cpu()
 
     def learn(self, max_actions: int, settings: dict[str, Any]) -> int:
-        """Fit the prior to the solutions; returns the number of their actions."""
-        numbers = sorted(self.plans)
+        """Fit the prior to the solutions and, in puzzles, to their reflections and rotations.
+
+        Returns:
+            The number of actions that it learned from; with none it stays as it is.
+        """
+        numbers = [number for number in sorted(self.plans) if len(self.plans[number])]
+        if not numbers:
+            return 0
         state, plans = self.problems[torch.tensor(numbers)], [self.plans[number] for number in numbers]
-        how: dict[str, Any] = {"max_actions": max_actions, "generator": self.generator} | settings
-        return fit_solutions(self.prior, self.world, state, plans, **how)
+        if isinstance(self.world, PuzzleWorld):
+            times = max_actions // sum(map(len, plans))
+            state, plans = with_symmetries(self.world, state, plans, times, self.generator)
+        order = torch.randperm(len(plans), generator=self.generator)
+        state, plans = state[order], [plans[k] for k in order.tolist()]
+        if isinstance(self.prior, LogLinearPrior):
+            self.prior.fit_steps(solution_steps(self.world, state, plans), generator=self.generator, **settings)
+        else:
+            seen = solution_plans(self.world, state, plans, self.prior.context_per)
+            self.prior.fit(seen, generator=self.generator, **settings)
+        return sum(map(len, plans))
 
     def end(self, sweep: Sweep) -> None:
         """Keep a finished sweep."""
@@ -278,7 +254,7 @@ class _Bootstrap:
     def _restore(self, folder: Path, sweeps: int) -> None:
         kept = _read_sweeps(folder)
         if kept["asked"] != self.asked:
-            raise ValueError(f"{folder}: holds sweeps of another call, with {kept['asked']}; give another folder")
+            raise ValueError(f"`folder` must hold sweeps of the same call, got {folder}, of {kept['asked']}.")
         self.done = kept["sweeps"][:sweeps]
         last = self.done[-1].number
         saved = load(folder / f"prior-{last}")
@@ -286,9 +262,14 @@ class _Bootstrap:
             # First: it may choose sizes, and make the modules that hold the state.
             self.prior.restore(saved.learned)
         if type(saved) is not type(self.prior) or saved.config != self.prior.config:
-            raise ValueError(f"{folder}: its prior is {saved}, not {self.prior}; give another folder")
+            raise ValueError(f"`folder` must hold {self.prior}, got {folder}, which holds {saved}.")
         self.prior.load_state_dict(saved.state_dict())
         self.plans = read_solutions(folder, last)
+        plans, state = list(self.plans.values()), self.problems[torch.tensor(list(self.plans), dtype=torch.long)]
+        lengths = torch.tensor([len(plan) for plan in plans], dtype=torch.long)
+        final, _ = follow_plans(self.world, state, pad_plans(plans, self.world.num_actions), lengths)
+        if not bool(self.world.solved(final).all()):
+            raise ValueError(f"`folder` must hold solutions in this world, got {folder}, of another.")
         self.generator.set_state(torch.tensor(kept["generator"], dtype=torch.uint8))
 
 
@@ -301,7 +282,7 @@ def _read_sweeps(folder: Path) -> dict[str, Any]:
     except (KeyError, TypeError):
         found = {"sweeps": []}
     if not found["sweeps"]:
-        raise ValueError(f"{path}: damaged; give another folder")
+        raise ValueError(f"{path}: it must hold sweeps, got a damaged file. Give another folder.")
     return found
 
 
@@ -321,46 +302,8 @@ def read_solutions(folder: str | PathLike[str], sweep: int | None = None) -> dic
     try:
         tensors = read_tensors(path.read_bytes())
     except SafetensorError as error:
-        raise ValueError(f"{path}: damaged ({error}); give another folder") from error
+        raise ValueError(f"{path}: it must hold solutions, got a damaged file ({error}).") from error
     return {int(name): plan for name, plan in sorted(tensors.items())}
-
-
-def fit_solutions(
-    prior: Prior,
-    world: World,
-    state: Tensor,
-    plans: Sequence[Tensor],
-    *,
-    max_actions: int = 2_000_000,
-    generator: torch.Generator,
-    **settings: Any,
-) -> int:
-    """Fit a prior to solutions and, in puzzles, to their reflections and rotations; see `bootstrap`.
-
-    Args:
-        prior: fitted in place.
-        world: where the problems are.
-        state: `[N, ...]`: the problems.
-        plans: the N solutions, actions `[l]` each; empty ones are left out.
-        max_actions, generator, settings: see `bootstrap`.
-
-    Returns:
-        The number of actions that it learned from; with none it stays as it is.
-    """
-    some = [k for k, plan in enumerate(plans) if len(plan)]
-    if not some:
-        return 0
-    state, plans = state[torch.tensor(some, dtype=torch.long)], [plans[k] for k in some]
-    own = sum(map(len, plans))
-    if isinstance(world, PuzzleWorld):
-        state, plans = with_symmetries(world, state, plans, max_actions // max(own, 1), generator)
-    order = torch.randperm(len(plans), generator=generator)
-    state, plans = state[order], [plans[k] for k in order.tolist()]
-    if isinstance(prior, PatternPrior):
-        prior.fit_steps(solution_steps(world, state, plans), generator=generator, **settings)
-    else:
-        prior.fit(solution_plans(world, state, plans, prior.context_per), generator=generator, **settings)
-    return sum(map(len, plans))
 
 
 def with_symmetries(
@@ -382,25 +325,23 @@ def with_symmetries(
 
 def solution_steps(world: World, state: Tensor, plans: Sequence[Tensor]) -> Steps:
     """The steps of plans from `state [N, ...]`, in a world whose observations are patterns, plan after plan."""
-    if isinstance(world, PuzzleWorld) and world.device.type == "cpu":
-        from neuroprior.puzzles.compiled_search import patterns_along  # priors of patterns learn with numba alone
-
-        patterns = patterns_along(world, state, plans)
-    else:
-        one = [solution_plans(world, state[k : k + 1], [plan], "step").context for k, plan in enumerate(plans)]
-        patterns = torch.cat([context[0] for context in one if context is not None])
-    action = torch.cat(list(plans)).long()
-    begin = torch.tensor([0, *map(len, plans)]).cumsum(0)[:-1]
+    action, lengths = torch.cat(list(plans)).long(), torch.tensor([len(plan) for plan in plans])
+    begin = lengths.cumsum(0) - lengths
     last = torch.nn.functional.pad(action, (1, -1))
     last[begin] = world.num_actions
-    plan = torch.arange(len(plans)).repeat_interleave(torch.tensor([len(one) for one in plans]))
-    return Steps(patterns, last, action, plan)
+    patterns = torch.zeros(len(action), world.observe(state[:1]).shape[1], dtype=torch.int32)
+    now = state.clone()
+    for t in range(int(lengths.max())):
+        on = (lengths > t).nonzero()[:, 0]
+        patterns[begin[on] + t] = world.observe(now[on]).cpu()
+        now[on], _ = world.step(now[on], action[begin[on] + t].to(now.device))
+    return Steps(patterns, last, action, torch.arange(len(plans)).repeat_interleave(lengths))
 
 
 def solution_plans(world: World, state: Tensor, plans: Sequence[Tensor], context: str | None) -> Plans:
     """Plans from `state [N, ...]` as `Plans`, with what the world observes on the way, as a prior takes it."""
     lengths = torch.tensor([len(plan) for plan in plans])
-    actions = torch.nn.utils.rnn.pad_sequence(list(plans), batch_first=True).to(action_dtype(world.num_actions))
+    actions = pad_plans(plans, world.num_actions)
     seen, now = [], state
     for t in range(actions.shape[1]):
         seen.append(world.observe(now))

@@ -53,7 +53,6 @@ WITHOUT_EXAMPLE = {
             "HistoryPrior",
             "MujocoWorld",
             "NeuralPrior",
-            "PatternPrior",
         ),
         *(
             "Planner",

@@ -214,7 +214,7 @@ def learn(world=PUZZLE, prior=CHAIN, **settings):
         (lambda: list(extend_horizon(None, SHORT, GRID, [3], num_starts=4)), "prior: a Prior is expected"),
         (lambda: execute(ExhaustivePlanner(2), GRID, STARTS, 3, change=3), "change: a function of states"),
         (lambda: learn(generator=0), "generator: a torch.Generator"),
-        (lambda: learn(teacher=SamplingPlanner(CHAIN, 3, 4)), "teacher: a BestFirstPlanner"),
+        (lambda: learn(teacher=SamplingPlanner(CHAIN, 3, 4)), "`teacher` must be a BestFirstPlanner"),
         (lambda: learn(prior=None), "prior: a Prior is expected"),
         (lambda: learn(world=None), "world: a World"),
         (lambda: learn(guided=1), "guided: True or False"),

@@ -12,6 +12,7 @@ from torch import Tensor
 from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, Prior, World
 from neuroprior.puzzles import (
     AStarPlanner,
+    BestFirstPlanner,
     LevinPlanner,
     LogLinearPrior,
     SlidingTilesWorld,
@@ -23,10 +24,7 @@ from neuroprior.puzzles import (
 from neuroprior.puzzles.bootstrap import read_solutions, solution_plans, solution_steps, with_symmetries
 from neuroprior.worlds import cube
 from tests.puzzles.worlds.test_sokoban import LEVELS
-
-
-def seeded(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
+from tests.support.sources import seeded
 
 
 def tiles(number: int = 60) -> SlidingTilesWorld:
@@ -41,7 +39,7 @@ def test_what_is_learned_solves_more_with_less() -> None:
     world, held_out = tiles(), sliding_tiles(shape=(3, 3), scramble=40).reset(60, seeded(2))
     prior = prior_for(world)
     before = LevinPlanner(prior, 500).search(world, held_out)
-    sweeps = list(bootstrap(world, prior, world.boards, max_nodes=500, sweeps=4, generator=seeded()))
+    sweeps = list(bootstrap(world, prior, world.boards, max_nodes=500, sweeps=4, generator=seeded(0)))
     after = LevinPlanner(prior, 500).search(world, held_out)
     assert [sweep.number for sweep in sweeps] == [1, 2, 3, 4]
     assert sweeps[-1].solved > sweeps[0].solved
@@ -49,12 +47,19 @@ def test_what_is_learned_solves_more_with_less() -> None:
     assert float(after.expansions.double().mean()) < 0.7 * float(before.expansions.double().mean())
 
 
+def check_solution(world: World, start: Tensor, plan: Tensor) -> None:
+    state = start[None]
+    for action in plan.tolist():
+        state, _ = world.step(state, torch.tensor([action]))
+    assert world.solved(state).all()
+
+
 def test_an_interrupted_call_goes_on(tmp_path: Path) -> None:
     world = tiles(40)
     how: dict[str, Any] = {"max_nodes": 300, "epochs": 2}
     whole, parts = prior_for(world), prior_for(world)
-    once = list(bootstrap(world, whole, world.boards, sweeps=3, generator=seeded(), **how))
-    some = bootstrap(world, parts, world.boards, sweeps=3, generator=seeded(), folder=tmp_path, **how)
+    once = list(bootstrap(world, whole, world.boards, sweeps=3, generator=seeded(0), **how))
+    some = bootstrap(world, parts, world.boards, sweeps=3, generator=seeded(0), folder=tmp_path, **how)
     next(some), next(some)  # and then it is killed
     again = prior_for(world)
     resumed = list(bootstrap(world, again, world.boards, sweeps=3, generator=seeded(9), folder=tmp_path, **how))
@@ -64,67 +69,55 @@ def test_an_interrupted_call_goes_on(tmp_path: Path) -> None:
     solutions = read_solutions(tmp_path)
     assert len(solutions) == resumed[-1].solutions
     for number, plan in solutions.items():
-        state = world.boards[number][None]
-        for action in plan.tolist():
-            state, _ = world.step(state, torch.tensor([action]))
-        assert world.solved(state).all()
-    for others in (world.boards[:10], world.boards.flip(0)):
-        with pytest.raises(ValueError, match="another call"):
-            list(bootstrap(world, prior_for(world), others, folder=tmp_path, **how))
-    for other in ({"epochs": 3}, {"max_actions": 10}, {"teacher": AStarPlanner(world.lower_bound)}, {"l2": 0.5}):
-        with pytest.raises(ValueError, match="another call"):
-            list(bootstrap(world, prior_for(world), world.boards, folder=tmp_path, **how | other))
-    assert len(list(bootstrap(world, prior_for(world), world.boards, folder=tmp_path, sweeps=3, **how))) == 3
+        check_solution(world, world.boards[number], plan)
+    one = prior_for(world)
+    first = list(bootstrap(world, one, world.boards, sweeps=1, folder=tmp_path, **how))
+    assert [sweep.solutions for sweep in first] == [once[0].solutions]
+    alone = prior_for(world)
+    list(bootstrap(world, alone, world.boards, sweeps=1, generator=seeded(0), **how))
+    assert one.weights.equal(alone.weights)
     rarer = LogLinearPrior(4, len(world.windows.windows), min_count=3)
-    with pytest.raises(ValueError, match="its prior is"):
-        list(bootstrap(world, rarer, world.boards, folder=tmp_path, **how))
-
-
-def test_a_combined_prior_goes_on_with_what_it_learned(tmp_path: Path) -> None:
-    """Restored, it has new experts: what they learned is read after that."""
-    world = sliding_tiles(shape=(2, 2), scramble=6)
-    problems, plans = world.reset(60, seeded()), torch.randint(4, (5, 6), generator=seeded(1))
-    first, again = (CombinedPrior(4, [MarkovPrior(4, 1)]) for _ in range(2))
-    for prior in (first, again):
-        list(bootstrap(world, prior, problems, sweeps=1, generator=seeded(), folder=tmp_path))
-    assert again.log_prob(plans).equal(first.log_prob(plans))
+    for prior, problems, other, message in (
+        (prior_for(world), world.boards[:10], {}, "the same call"),
+        (prior_for(world), world.boards.flip(0), {}, "the same call"),
+        (prior_for(world), world.boards, {"epochs": 3}, "the same call"),
+        (prior_for(world), world.boards, {"max_actions": 10}, "the same call"),
+        (prior_for(world), world.boards, {"teacher": AStarPlanner(world.lower_bound)}, "the same call"),
+        (prior_for(world), world.boards, {"l2": 0.5}, "the same call"),
+        (rarer, world.boards, {}, "`folder` must hold LogLinearPrior"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            list(bootstrap(world, prior, problems, folder=tmp_path, **how | other))
 
 
 @pytest.mark.parametrize(
     "make",
-    [lambda: GRUPrior(4), lambda: CombinedPrior(4, [MarkovPrior(4, 0), MarkovPrior(4, 1)])],
-    ids=["network", "several experts"],
+    [
+        lambda: GRUPrior(4),
+        lambda: CombinedPrior(4, [MarkovPrior(4, 1)]),
+        lambda: CombinedPrior(4, [MarkovPrior(4, 0), MarkovPrior(4, 1)]),
+    ],
+    ids=["network", "one expert", "several experts"],
 )
 def test_what_a_fit_chooses_does_not_keep_a_prior_from_going_on(make: Callable[[], Prior], tmp_path: Path) -> None:
     world = sliding_tiles(shape=(2, 2), scramble=6)
-    problems, plans = world.reset(60, seeded()), torch.randint(4, (5, 6), generator=seeded(1))
+    problems, plans = world.reset(60, seeded(0)), torch.randint(4, (5, 6), generator=seeded(1))
     how: dict[str, Any] = {"max_steps": 2, "progress": False} if isinstance(make(), GRUPrior) else {}
     first, again = make(), make()
     for prior in (first, again):
-        list(bootstrap(world, prior, problems, sweeps=1, generator=seeded(), folder=tmp_path, **how))
+        list(bootstrap(world, prior, problems, sweeps=1, generator=seeded(0), folder=tmp_path, **how))
     assert again.log_prob(plans).equal(first.log_prob(plans))
 
 
 def test_other_validation_plans_are_another_call(tmp_path: Path) -> None:
     world = sliding_tiles(shape=(2, 2), scramble=6)
-    problems = world.reset(60, seeded())
+    problems = world.reset(60, seeded(0))
     how: dict[str, Any] = {"sweeps": 1, "max_steps": 2, "progress": False, "folder": tmp_path}
     validation = Plans(torch.zeros(6, 5, dtype=torch.long), 4)
-    list(bootstrap(world, GRUPrior(4), problems, validation=validation, generator=seeded(), **how))
+    list(bootstrap(world, GRUPrior(4), problems, validation=validation, generator=seeded(0), **how))
     other = Plans(torch.ones(6, 5, dtype=torch.long), 4)
-    with pytest.raises(ValueError, match="another call"):
+    with pytest.raises(ValueError, match="the same call"):
         list(bootstrap(world, GRUPrior(4), problems, validation=other, **how))
-
-
-def test_fewer_sweeps_of_a_folder_are_those_of_a_call_with_fewer(tmp_path: Path) -> None:
-    world = tiles(40)
-    how: dict[str, Any] = {"max_nodes": 300, "epochs": 2}
-    short, first = prior_for(world), prior_for(world)
-    once = list(bootstrap(world, short, world.boards, sweeps=1, generator=seeded(), **how))
-    list(bootstrap(world, prior_for(world), world.boards, sweeps=2, generator=seeded(), folder=tmp_path, **how))
-    again = list(bootstrap(world, first, world.boards, sweeps=1, folder=tmp_path, **how))
-    assert [sweep.solutions for sweep in again] == [sweep.solutions for sweep in once]
-    assert first.weights.equal(short.weights)
 
 
 class Line(World):
@@ -150,47 +143,28 @@ class Line(World):
 
 
 def test_another_world_or_teacher_is_another_call(tmp_path: Path) -> None:
-    start, zero = torch.arange(3, 9), torch.zeros_like
+    start = torch.arange(3, 9)
 
-    def call(goal: int, teacher: AStarPlanner | None, folder: Path) -> list[Any]:
-        how: dict[str, Any] = {"sweeps": 2, "first": 6, "max_nodes": 500, "folder": folder, "teacher": teacher}
-        return list(bootstrap(Line(goal), MarkovPrior(2, 1), start, generator=seeded(), **how))
+    def call(goal: int, teacher: BestFirstPlanner | None) -> list[Any]:
+        how: dict[str, Any] = {"sweeps": 2, "first": 6, "max_nodes": 500, "folder": tmp_path, "teacher": teacher}
+        return list(bootstrap(Line(goal), MarkovPrior(2, 1), start, generator=seeded(0), **how))
 
-    first = AStarPlanner(lambda state: state.double(), max_nodes=50)
-    for teacher, folder in ((None, tmp_path / "alone"), (first, tmp_path / "taught")):
-        done = call(0, teacher, folder)
-        assert call(0, teacher, folder) == done
-        with pytest.raises(ValueError, match="another call"):
-            call(12, teacher, folder)
+    def left(state: Tensor) -> Tensor:
+        return state.double()
+
+    done = call(0, AStarPlanner(left, max_nodes=50))
+    assert call(0, AStarPlanner(left, max_nodes=50)) == done
+    with pytest.raises(ValueError, match="solutions in this world"):
+        call(12, AStarPlanner(left, max_nodes=50))
     for other in (
         None,
-        AStarPlanner(lambda state: zero(state).double(), max_nodes=50),
-        AStarPlanner(lambda state: state.double(), max_nodes=50, weight=3.0),
-        AStarPlanner(lambda state: state.double(), max_nodes=60),
+        AStarPlanner(left, max_nodes=50, weight=3.0),
+        AStarPlanner(left, max_nodes=60),
         AStarPlanner(None, max_nodes=50),
         LevinPlanner(MarkovPrior(2, 1), max_nodes=50),
     ):
-        with pytest.raises(ValueError, match="another call"):
-            call(0, other, tmp_path / "taught")
-    one, same, other = (MarkovPrior(2, 0).fit(torch.tensor([row])) for row in ([0, 0, 1], [0, 0, 1], [1, 1, 0]))
-    done = call(0, LevinPlanner(one, 60), tmp_path / "by a prior")
-    assert call(0, LevinPlanner(same, 60), tmp_path / "by a prior") == done
-    with pytest.raises(ValueError, match="another call"):
-        call(0, LevinPlanner(other, 60), tmp_path / "by a prior")
-
-
-class DeadEnds(Line):
-    """No action is legal at the left end, or where the goal is reached."""
-
-    all_legal = False
-
-    def legal_actions(self, state: Tensor) -> Tensor:
-        return ((state > 0) & ~self.solved(state))[:, None].expand(-1, 2)
-
-
-def test_dead_ends_do_not_matter(tmp_path: Path) -> None:
-    sweeps = bootstrap(DeadEnds(4), MarkovPrior(2, 1), torch.arange(1, 9), sweeps=1, folder=tmp_path)
-    assert [sweep.solved for sweep in sweeps] == [1.0]
+        with pytest.raises(ValueError, match="the same call"):
+            call(0, other)
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"asked": {}, "sweeps": [], "generator": []}', '{"sweeps": [3]}'])
@@ -201,40 +175,25 @@ def test_damaged_folders_are_refused(content: str, tmp_path: Path) -> None:
         lambda: read_solutions(tmp_path),
         lambda: list(bootstrap(world, prior_for(world), world.boards, folder=tmp_path)),
     ):
-        with pytest.raises(ValueError, match=r"sweeps\.json: (damaged|not JSON)"):
+        with pytest.raises(ValueError, match=r"sweeps\.json: (it must hold sweeps|not JSON)"):
             read()
     (tmp_path / "solutions-1.safetensors").write_bytes(b"nothing")
-    with pytest.raises(ValueError, match=r"solutions-1\.safetensors: damaged"):
+    with pytest.raises(ValueError, match=r"solutions-1\.safetensors: it must hold solutions"):
         read_solutions(tmp_path, 1)
 
 
 def test_problems_that_are_solved_at_the_start_teach_nothing() -> None:
     world, prior = tiles(4), prior_for(tiles(4))
     state = torch.cat([world.goal[None], world.boards])
-    sweeps = list(bootstrap(world, prior, state, max_nodes=1, first=1, sweeps=2, generator=seeded()))
+    sweeps = list(bootstrap(world, prior, state, max_nodes=1, first=1, sweeps=2, generator=seeded(0)))
     assert [(sweep.solutions, sweep.actions) for sweep in sweeps] == [(1, 0), (1, 0)]
     assert not prior.after.any()
-
-
-def test_what_cannot_be_learned_is_refused_before_the_first_search() -> None:
-    world = tiles(4)
-
-    def unused(state: torch.Tensor) -> torch.Tensor:
-        raise AssertionError
-
-    for prior, settings, message in (
-        (prior_for(world), {"epoch": 2}, "epoch: not a setting"),
-        (LogLinearPrior(4, 3), {}, "3 patterns"),
-        (LogLinearPrior(3, 3), {}, "it has 3 actions"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            next(bootstrap(world, prior, world.boards, teacher=AStarPlanner(unused), **settings))
 
 
 def test_the_budget_and_the_problems_grow() -> None:
     world = sliding_tiles(sliding_tiles(shape=(3, 3), scramble=8).reset(100, seeded(3)))
     sweeps = list(
-        bootstrap(world, prior_for(world), world.boards, max_nodes=50, first=10, sweeps=5, generator=seeded())
+        bootstrap(world, prior_for(world), world.boards, max_nodes=50, first=10, sweeps=5, generator=seeded(0))
     )
     assert [sweep.problems for sweep in sweeps[:2]] == [10, 40 if sweeps[0].solved >= 0.75 else 10]
     assert sweeps[-1].problems == 100
@@ -247,7 +206,7 @@ def test_the_budget_and_the_problems_grow() -> None:
 def test_where_nothing_is_solved_the_budget_grows(tmp_path: Path) -> None:
     world = tiles(10)
     sweeps = list(
-        bootstrap(world, prior_for(world), world.boards, max_nodes=2, sweeps=12, folder=tmp_path, generator=seeded())
+        bootstrap(world, prior_for(world), world.boards, max_nodes=2, sweeps=12, folder=tmp_path, generator=seeded(0))
     )
     assert sweeps[0].solutions == sweeps[0].actions == 0
     assert [sweep.max_nodes for sweep in sweeps[:3]] == [2, 4, 8]
@@ -260,7 +219,7 @@ def test_a_teacher_and_a_heuristic_help() -> None:
     teacher = AStarPlanner(world.lower_bound, 3.0, 2000)
     prior = prior_for(world)
     sweeps = list(
-        bootstrap(world, prior, world.boards, max_nodes=20, sweeps=2, teacher=teacher, guided=True, generator=seeded())
+        bootstrap(world, prior, world.boards, max_nodes=20, sweeps=2, teacher=teacher, guided=True, generator=seeded(0))
     )
     assert sweeps[0].solved == 1.0
     assert (sweeps[0].max_nodes, sweeps[1].max_nodes) == (2000, 20)
@@ -271,19 +230,15 @@ def test_symmetries_of_solutions_are_solutions() -> None:
     others = [sliding_tiles(goal=goal, scramble=30) for goal in (corner, side)]
     assert [world.symmetries() for world in others] == [2, 1]  # a blank beside the diagonal would go elsewhere
     for world in (tiles(), *others, sokoban(LEVELS)):
-        state = world.reset(12, seeded()) if world.boards is None else world.boards[:12]
+        state = world.reset(12, seeded(0)) if world.boards is None else world.boards[:12]
         found = AStarPlanner(world.lower_bound, 5.0, 3000).search(world, state)
         assert found.solved.sum() > 5
         kept = found.solved
         plans = [plan[:length] for plan, length in zip(found.plan[kept], found.lengths[kept], strict=True)]
-        states, more = with_symmetries(world, state[kept], plans, 8, seeded())
+        states, more = with_symmetries(world, state[kept], plans, 8, seeded(0))
         assert len(more) == world.symmetries() * len(plans)
         for start, plan in zip(states, more, strict=True):
-            now = start[None]
-            for action in plan.tolist():
-                now, _ = world.step(now, torch.tensor([action]))
-            assert world.solved(now).all()
-        # The compiled replay gives the steps of the world's own.
+            check_solution(world, start, plan)
         steps = solution_steps(world, states, more)
         same = Steps.of(solution_plans(world, states, more, "step"))
         assert all(one.equal(other) for one, other in zip(steps, same, strict=True))
@@ -293,22 +248,38 @@ def test_priors_without_patterns_learn_too() -> None:
     world = cube("quarter", scramble=4)
     prior = MarkovPrior(6, 2)
     state = world.reset(50, seeded(4))
-    sweeps = list(bootstrap(world, prior, state, max_nodes=400, sweeps=2, generator=seeded()))
+    sweeps = list(bootstrap(world, prior, state, max_nodes=400, sweeps=2, generator=seeded(0)))
     assert sweeps[-1].mean_expansions < sweeps[0].mean_expansions
 
 
-def test_bad_input_is_refused() -> None:
-    world = tiles(5)
-    hard = sliding_tiles(shape=(4, 4), scramble=500)
-    for change, message in (({"sweeps": 0}, "sweeps"), ({"max_nodes": 0}, "max_nodes"), ({"epochs": 0}, "epochs")):
-        with pytest.raises(ValueError, match=message):
-            list(bootstrap(world, prior_for(world), world.boards, generator=seeded(), **change))
-    with pytest.raises(ValueError, match="none of 3 was solved within 20 expansions"):
-        list(bootstrap(hard, prior_for(hard), hard.reset(3, seeded()), max_nodes=5, sweeps=3, generator=seeded()))
-    with pytest.raises(ValueError, match="at least one"):
-        list(bootstrap(world, prior_for(world), world.boards[:0]))
-    with pytest.raises(ValueError, match="lower_bound"):
-        list(bootstrap(cube(), MarkovPrior(9, 1), torch.tensor([5]), guided=True))
+def unused(state: Tensor) -> Tensor:
+    raise AssertionError
+
+
+@pytest.mark.parametrize(
+    ("world", "prior", "how", "message"),
+    [
+        (tiles(4), None, {"sweeps": 0}, "sweeps"),
+        (tiles(4), None, {"max_nodes": 0}, "max_nodes"),
+        (tiles(4), None, {"epochs": 0}, "epochs"),
+        (tiles(4), None, {"problems": tiles(4).boards[:0]}, "`problems` must hold at least one"),  # type: ignore[index]
+        # All of these before the first search:
+        (tiles(4), None, {"epoch": 2, "teacher": AStarPlanner(unused)}, "epoch: not a setting"),
+        (tiles(4), LogLinearPrior(4, 3), {"teacher": AStarPlanner(unused)}, "3 patterns"),
+        (tiles(4), LogLinearPrior(3, 3), {"teacher": AStarPlanner(unused)}, "it has 3 actions"),
+        (cube(), MarkovPrior(9, 1), {"problems": torch.tensor([5]), "guided": True}, "`guided` must be False"),
+        (
+            sliding_tiles(sliding_tiles(shape=(4, 4), scramble=500).reset(3, seeded(0))),
+            None,
+            {"max_nodes": 5, "sweeps": 3},
+            "enough to solve some of 3 problems, got none that 20 expansions solve",
+        ),
+    ],
+)
+def test_bad_input_is_refused(world: Any, prior: Any, how: dict[str, Any], message: str) -> None:
+    how = {"problems": getattr(world, "boards", None)} | how
+    with pytest.raises(ValueError, match=message):
+        list(bootstrap(world, prior or prior_for(world), generator=seeded(0), **how))
 
 
 def test_solutions_are_learned_from_themselves_before_any_symmetry_of_theirs() -> None:

@@ -188,3 +188,19 @@ def test_gymnasium_is_imported_only_where_it_is_needed(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     with refuses("pip install 'neuroprior[gym]'", error=ImportError):
         from_gymnasium("Taxi-v4")
+
+
+def test_goals_of_minigrid_are_solved():
+    pytest.importorskip("minigrid")
+    world = from_gymnasium("MiniGrid-Empty-5x5-v0", progress=False)
+    states = torch.arange(world.num_states)
+    assert world.has_goal
+    assert world.solved(states).equal(world.terminated(states))
+    assert 0 < world.solved(states).sum() < len(states)
+
+
+def test_lava_and_holes_are_no_goals():
+    world = from_gymnasium("FrozenLake-v1")
+    states = torch.arange(16)
+    assert world.solved(states).nonzero().flatten().tolist() == [15]
+    assert world.terminated(states).sum() == 5

@@ -1,4 +1,4 @@
-"""Weights of patterns learned by a compiled loop, for the priors of `neuroprior.puzzles.priors`; this loads numba."""
+"""Weights of patterns learned by a compiled loop, for `LogLinearPrior`."""
 
 from typing import Any
 
@@ -29,20 +29,20 @@ def hash_table(codes: Array, values: Array) -> tuple[Array, Array]:
     return places, placed
 
 
-def frequent(parts: list[Array], min_count: int) -> Array:
-    """The codes that occur at least `min_count` times in `parts` (integers `[M, F]` each), sorted, int32."""
+def frequent(patterns: Array, min_count: int) -> Array:
+    """The codes that occur at least `min_count` times in `patterns`, integers `[M, F]`; sorted, int32."""
     size = 2**16
     codes, counts = np.full(size, -1, dtype=np.int64), np.zeros(size, dtype=np.int32)
     used = 0
-    for part in parts:
-        for at in range(0, len(part), 4096):
-            while (used + part[at : at + 4096].size) * 4 > len(codes) * 3:  # room for all that could be new
-                codes, counts = _larger(codes, counts)
-            used += _count(codes, counts, part[at : at + 4096])
+    for at in range(0, len(patterns), 4096):
+        some = patterns[at : at + 4096]
+        while (used + some.size) * 4 > len(codes) * 3:  # room for all that could be new
+            codes, counts = _larger(codes, counts)
+        used += _count(codes, counts, some)
     return np.sort(codes[counts >= min_count]).astype(np.int32)
 
 
-def numbered(vocabulary: Array, patterns: Array) -> Array:
+def number_patterns(vocabulary: Array, patterns: Array) -> Array:
     """The row of each of `patterns [M, F]` in a sorted vocabulary `[V]`, V for those that are not in it; int32."""
     codes, rows = hash_table(vocabulary, np.arange(len(vocabulary), dtype=np.int32))
     out = np.empty(patterns.shape, dtype=np.int32)
@@ -97,11 +97,8 @@ def epoch(
     counts: Array,
     weights: Array,
     after: Array,
-    embeddings: Array,
-    layers: Array,
-    biases: Array,
-    out: Array,
-    squares: tuple[Array, Array, Array, Array, Array, Array],
+    weight_squares: Array,
+    after_squares: Array,
     rate: float,
     l2: float,
     learn: bool,
@@ -117,38 +114,21 @@ def epoch(
         counts: float32 `[M]`: how much each step counts.
         weights: float32 `[V + 1, A]`: what each pattern adds to the logits; its last row stays 0.
         after: float32 `[., A]`: what the last actions add.
-        embeddings: float32 `[V + 1, E]`: E = 0: no network.
-        layers, biases, out: float32 `[D, E, E]`, `[D, E]`, `[A, E]`: the network on the sum of the embeddings.
-        squares: sums of squared gradients of these six; of embeddings `[V + 1]`, one number a row.
-        rate, l2: learning rate, and the penalty of weights and embeddings.
+        weight_squares, after_squares: sums of squared gradients of these.
+        rate, l2: learning rate, and the penalty of weights.
         learn: False: nothing is changed.
         losses: float64 `[M]`: gets the log-loss of each of these steps, nats, before it was learned from.
     """
-    unknown, actions, size, depth = len(weights) - 1, weights.shape[1], embeddings.shape[1], len(layers)
+    unknown, actions = len(weights) - 1, weights.shape[1]
     logits, errors = np.empty(actions), np.empty(actions, dtype=np.float32)
-    hidden = np.empty((depth + 1, size), dtype=np.float32)
-    back, further = np.empty(size, dtype=np.float32), np.empty(size, dtype=np.float32)
-    w2, a2, e2, l_2, b2, o2 = squares
     step, decay = np.float32(rate), np.float32(l2)
     for i in order:
         for a in range(actions):
             logits[a] = after[last[i], a]
-        hidden[0] = 0
         for row in rows[i]:
             if row != unknown:
                 for a in range(actions):
                     logits[a] += weights[row, a]
-                for e in range(size):
-                    hidden[0, e] += embeddings[row, e]
-        for k in range(depth):
-            for e in range(size):
-                total = biases[k, e]
-                for f in range(size):
-                    total += layers[k, e, f] * max(hidden[k, f], np.float32(0))
-                hidden[k + 1, e] = total
-        for a in range(actions):
-            for e in range(size):
-                logits[a] += out[a, e] * max(hidden[depth, e], np.float32(0))
         top = logits.max()
         total = 0.0
         for a in range(actions):
@@ -158,44 +138,13 @@ def epoch(
         if not learn:
             continue
         for a in range(actions):
-            errors[a] = counts[i] * (np.exp(logits[a] - top) / total - (1.0 if a == chosen else 0.0))
-        back[:] = 0
-        for a in range(actions):
-            g = errors[a]
-            a2[last[i], a] += g * g
-            after[last[i], a] -= step * g / np.sqrt(a2[last[i], a])
-            for e in range(size):
-                lit = max(hidden[depth, e], np.float32(0))
-                if lit > 0:
-                    back[e] += g * out[a, e]
-                    o2[a, e] += g * g * lit * lit
-                    out[a, e] -= step * g * lit / np.sqrt(o2[a, e])
-        for k in range(depth - 1, -1, -1):
-            further[:] = 0
-            for e in range(size):
-                g = back[e]
-                if g == 0:
-                    continue
-                b2[k, e] += g * g
-                biases[k, e] -= step * g / np.sqrt(b2[k, e])
-                for f in range(size):
-                    lit = max(hidden[k, f], np.float32(0))
-                    if lit > 0:
-                        further[f] += g * layers[k, e, f]
-                        l_2[k, e, f] += g * g * lit * lit
-                        layers[k, e, f] -= step * g * lit / np.sqrt(l_2[k, e, f])
-            back[:] = further
-        norm = np.float32(0)
-        for e in range(size):
-            norm += back[e] * back[e]
+            g = np.float32(counts[i] * (np.exp(logits[a] - top) / total - (1.0 if a == chosen else 0.0)))
+            errors[a] = g
+            after_squares[last[i], a] += g * g
+            after[last[i], a] -= step * g / np.sqrt(after_squares[last[i], a])
         for row in rows[i]:
             if row != unknown:
                 for a in range(actions):
                     g = errors[a] + decay * weights[row, a]
-                    w2[row, a] += g * g
-                    weights[row, a] -= step * g / np.sqrt(w2[row, a])
-                if size > 0:
-                    e2[row] += norm / size
-                    scale = step / np.sqrt(e2[row])
-                    for e in range(size):
-                        embeddings[row, e] -= scale * (back[e] + decay * embeddings[row, e])
+                    weight_squares[row, a] += g * g
+                    weights[row, a] -= step * g / np.sqrt(weight_squares[row, a])

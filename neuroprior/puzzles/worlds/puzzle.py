@@ -1,73 +1,83 @@
-"""What puzzles on a board have in common: a mover that goes up, down, left or right, and a goal."""
+"""What Sokoban and sliding tiles share: a mover that goes up, down, left or right, patterns around it, and a goal."""
 
 from abc import abstractmethod
-from typing import Any, Literal
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from neuroprior._checks import check_count
 from neuroprior._random import generator_on
+from neuroprior.puzzles.worlds.rules import (
+    ACTIONS,
+    SOKOBAN,
+    TILES,
+    Array,
+    Rules,
+    bound_boards,
+    legal_in_boards,
+    observe_boards,
+    step_boards,
+)
 from neuroprior.puzzles.worlds.windows import Windows
 from neuroprior.worlds.world import World
-
-Observation = Literal["patterns", "board"]
 
 
 class PuzzleWorld(World):
     """A puzzle on a board `[H, W]`; the state is the board itself.
 
     Moving where one cannot changes nothing. The reward of the step that solves a board is 1, all others are 0; in a
-    solved board nothing moves any more.
+    solved board nothing moves any more. The rules are compiled loops on the CPU; states elsewhere are copied there and
+    back.
 
     Args:
         boards: uint8 `[n, H, W]`: those to start from; None: `reset` makes its own.
         shape: H and W.
         windows: whose patterns are observed.
-        observation: "patterns": int32 `[N, F]`, the active patterns of a state, see `Windows`. "board": float32
-            `[N, C * H * W]`: planes of the board, one after the other.
-
-    Attributes:
-        boards, shape, windows, observation: as given.
-        num_planes: C.
-
-    Raises:
-        ValueError: an argument is wrong.
+        kinds: int64 `[contents, H * W]`: what each content of a cell counts as in patterns.
+        outside: the kind of what lies outside of the board.
+        goal, distances: see `Rules`.
     """
 
-    num_actions = 4
+    num_actions = ACTIONS
     all_legal = False
     has_goal = True
     action_names = ("up", "down", "left", "right")
-    num_planes: int
 
     def __init__(
-        self, boards: Tensor | None, shape: tuple[int, int], windows: Windows, observation: Observation
+        self,
+        boards: Tensor | None,
+        shape: tuple[int, int],
+        windows: Windows,
+        *,
+        kinds: Array,
+        outside: int,
+        goal: Array,
+        distances: Array,
     ) -> None:
-        if observation not in ("patterns", "board"):
-            raise ValueError(f'observation: "patterns" or "board" is expected, not {observation!r}')
-        self.boards, self.shape, self.windows, self.observation = boards, shape, windows, observation
+        self.boards, self.shape, self.windows = boards, shape, windows
+        random, reach = np.random.default_rng(0), windows.radius
+        keys = random.integers(2**63, size=(len(kinds) + 1, kinds.shape[1]), dtype=np.uint64)
+        shifted = [(row + reach, column + reach, height, width) for row, column, height, width in windows.windows]
+        self.rules = Rules(
+            puzzle=TILES if len(goal) else SOKOBAN,
+            width=shape[1],
+            goal=goal,
+            distances=distances,
+            keys=keys,
+            kinds=kinds,
+            base=windows.base,
+            outside=outside,
+            windows=np.array(shifted, np.int32),
+            offsets=np.array(windows.offsets, np.int64),
+            radius=reach,
+        )
 
     @property
     @abstractmethod
     def device(self) -> torch.device:
         """Where the boards are."""
-
-    @abstractmethod
-    def mover(self, state: Tensor) -> Tensor:
-        """The cell of the mover, int64 `[N]`: its row times W plus its column."""
-
-    @abstractmethod
-    def kinds(self, state: Tensor) -> Tensor:
-        """The kind of each cell, `[N, H, W]` below `windows.base`, for patterns."""
-
-    @abstractmethod
-    def planes(self, state: Tensor) -> Tensor:
-        """The planes of boards, float32 `[N, C, H, W]`."""
-
-    @abstractmethod
-    def lower_bound(self, state: Tensor) -> Tensor:
-        """A number of moves, int64 `[N]`, that a solution needs at least: a heuristic that is consistent."""
 
     @abstractmethod
     def symmetries(self) -> int:
@@ -94,22 +104,56 @@ class PuzzleWorld(World):
         generator = generator_on(generator, self.device)
         return self.boards[torch.randint(len(self.boards), (batch_size,), generator=generator, device=self.device)]
 
+    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        """One step; an illegal action, and any action where the puzzle is solved, leaves the state as it is.
+
+        The reward is 1 for the step that solves the puzzle, else 0.
+        """
+        return self._step(state, action, absorbing=True)
+
+    def _step(self, state: Tensor, action: Tensor, absorbing: bool) -> tuple[Tensor, Tensor]:
+        boards = flat_boards(state)
+        after, reward = np.empty_like(boards), np.zeros(len(boards), np.float32)
+        step_boards(self.rules, boards, action.cpu().numpy(), absorbing, after, reward)
+        reached = torch.from_numpy(after).view(state.shape)
+        return reached.to(state.device), torch.from_numpy(reward).to(state.device)
+
+    def legal_actions(self, state: Tensor) -> Tensor:
+        """Actions that move something, `[N, 4]` bool; where there are none, all."""
+        legal = np.empty((len(state), ACTIONS), bool)
+        legal_in_boards(self.rules, flat_boards(state), legal)
+        return torch.from_numpy(legal).to(state.device)
+
     def terminated(self, state: Tensor) -> Tensor:
         """Where the puzzle is solved."""
         return self.solved(state)
 
     def observe(self, state: Tensor) -> Tensor:
-        """The active patterns, int32 `[N, F]`, or the planes of the board, float32 `[N, C * H * W]`."""
-        if self.observation == "board":
-            return self.planes(state).flatten(1)
-        mover, width = self.mover(state), state.shape[2]
-        row = mover.div(width, rounding_mode="floor")
-        return self.windows.codes(self.kinds(state), row, mover - row * width)
+        """The active patterns, int32 `[N, F]`."""
+        codes = np.empty((len(state), len(self.windows.windows)), np.int32)
+        observe_boards(self.rules, flat_boards(state), codes)
+        return torch.from_numpy(codes).to(state.device)
+
+    def lower_bound(self, state: Tensor) -> Tensor:
+        """A number of moves, int64 `[N]`, that a solution needs at least: a heuristic.
+
+        Of sliding tiles it is the sum of the tiles' Manhattan distances from their places, which is consistent. In
+        Sokoban boxes are matched with goals so that the sum of their Manhattan distances is least; with more than 5
+        boxes it is the sum of each box's distance to the nearest goal.
+        """
+        bound = np.empty(len(state), np.int64)
+        bound_boards(self.rules, flat_boards(state), bound)
+        return torch.from_numpy(bound).to(state.device)
 
     def check_state(self, state: Tensor) -> None:
-        height, width = self.shape
         if not isinstance(state, Tensor) or state.dtype != torch.uint8 or tuple(state.shape[1:]) != self.shape:
-            raise ValueError(f"state: uint8 of shape [B, {height}, {width}] is expected: boards")
+            got = f"{state.dtype} {list(state.shape)}" if isinstance(state, Tensor) else type(state).__name__
+            raise ValueError(f"`state` must be boards, uint8 [B, {self.shape[0]}, {self.shape[1]}], got {got}.")
+
+
+def flat_boards(state: Tensor) -> Array:
+    """Boards `[N, H, W]` as rows of cells for compiled loops, `[N, H * W]`."""
+    return np.ascontiguousarray(state.cpu().flatten(1).numpy())
 
 
 def board_tensor(name: str, boards: Any) -> Tensor:
@@ -117,9 +161,7 @@ def board_tensor(name: str, boards: Any) -> Tensor:
     try:
         return torch.as_tensor(boards)
     except (RuntimeError, TypeError, ValueError):
-        raise ValueError(
-            f"{name}: a file or boards of one size are expected, not this {type(boards).__name__}"
-        ) from None
+        raise ValueError(f"`{name}` must be a file or boards of one size, got this {type(boards).__name__}.") from None
 
 
 def reflected(board: Tensor, number: int) -> Tensor:

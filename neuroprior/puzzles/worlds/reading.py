@@ -49,7 +49,7 @@ def read_sokoban(path_or_text: str | Path) -> Boards:
     for number, line in enumerate(text.split("\n"), 1):
         row = line.rstrip()
         if row[:1].isdigit() and "#" in row and not row.strip(_ALL_SYMBOLS + "0123456789|()"):
-            raise ValueError(f"{name}, line {number}: rows of repeated symbols, such as {row!r}, are not understood")
+            raise ValueError(f"{name}, line {number}: rows must not be shortened by numbers, got {row!r}.")
         is_row = bool(row) and row.lstrip()[0] in _ALL_SYMBOLS
         if is_row:
             if not within:
@@ -57,13 +57,13 @@ def read_sokoban(path_or_text: str | Path) -> Boards:
                 first_lines.append(number)
             if unknown := row.strip(_ALL_SYMBOLS):
                 raise ValueError(
-                    f"{name}, level {len(levels) - 1}, line {number}: {unknown[0]!r} is no symbol of Sokoban (# wall,"
-                    " @ player, + player on goal, $ box, * box on goal, . goal, blank, - or _ floor)"
+                    f"{name}, level {len(levels) - 1}, line {number}: symbols must be # wall, @ player, + player on"
+                    f" goal, $ box, * box on goal, . goal, blank, - or _ floor, got {unknown[0]!r}."
                 )
             levels[-1].append(row)
         within = is_row
     if not levels:
-        raise ValueError(f"{name}: there is no level in it")
+        raise ValueError(f"{name}: it must hold a level, got none.")
     height, width = max(map(len, levels)), max(len(row) for level in levels for row in level)
     check_memory(len(levels) * height * width, levels=name)
     filled = "".join(
@@ -73,24 +73,22 @@ def read_sokoban(path_or_text: str | Path) -> Boards:
     code[[ord(symbol) for symbol in SYMBOLS]] = range(len(SYMBOLS))
     boards = code[np.frombuffer(filled.encode("ascii"), dtype=np.uint8)].reshape(len(levels), height, width)
     if (wrong := count_problem(boards)) is not None:
-        raise ValueError(f"{name}, level {wrong[0]}, line {first_lines[wrong[0]]}: {wrong[1]}")
+        raise ValueError(f"{name}, level {wrong[0]}, line {first_lines[wrong[0]]}: it {wrong[1]}")
     return boards
 
 
 def count_problem(boards: Boards) -> tuple[int, str] | None:
     """The first of `boards [n, H, W]` that is no level by its numbers of players, boxes and goals, and why."""
-    players, boxes, goals = (
-        np.isin(boards, codes).sum((1, 2)) for codes in (np.array([5, 6]), np.array([3, 4]), np.array([2, 4, 6]))
-    )
+    players, boxes, goals = (np.isin(boards, codes).sum((1, 2)) for codes in ([5, 6], [3, 4], [2, 4, 6]))
     wrong = np.flatnonzero((players != 1) | (boxes != goals) | (boxes == 0))
     if not len(wrong):
         return None
     first = int(wrong[0])
     if players[first] != 1:
-        return first, f"one player is expected, not {players[first]}"
+        return first, f"must have one player, got {players[first]}."
     if boxes[first] != goals[first]:
-        return first, f"as many boxes as goals are expected, not {boxes[first]} and {goals[first]}"
-    return first, "at least one box is expected"
+        return first, f"must have as many boxes as goals, got {boxes[first]} and {goals[first]}."
+    return first, "must have at least one box, got none."
 
 
 def format_sokoban(board: npt.ArrayLike) -> str:
@@ -107,7 +105,7 @@ def format_sokoban(board: npt.ArrayLike) -> str:
     """
     codes = np.asarray(board)
     if codes.ndim != 2 or codes.dtype.kind not in "iu" or codes.size == 0 or codes.min() < 0 or codes.max() > 6:
-        raise ValueError("board: integers [H, W] from 0 to 6 are expected")
+        raise ValueError(f"`board` must be integers [H, W] from 0 to 6, got {codes.dtype} {list(codes.shape)}.")
     return "\n".join("".join(SYMBOLS[code] for code in row) for row in codes)
 
 
@@ -134,22 +132,26 @@ def read_tiles(path: str | Path, shape: tuple[int, int] | None = None) -> Boards
     name, text = _text_of(path)
     lines = [(number, line.split()) for number, line in enumerate(text.split("\n"), 1) if line.strip()]
     if not lines:
-        raise ValueError(f"{name}: there is no puzzle in it")
+        raise ValueError(f"{name}: it must hold a puzzle, got none.")
     if shape is not None:
         shape = board_shape(shape)
     cells = len(lines[0][1]) if shape is None else shape[0] * shape[1]
     if cells > MOST_TILES:
-        raise ValueError(f"{name}: boards of at most {MOST_TILES} cells are expected, not {cells}")
+        raise ValueError(f"{name}: boards must have at most {MOST_TILES} cells, got {cells}.")
     side = math.isqrt(cells)
     if shape is None and side * side != cells:
-        raise ValueError(f"{name}, line {lines[0][0]}: {cells} numbers are no square board; give shape=(height, width)")
+        raise ValueError(
+            f"{name}, line {lines[0][0]}: boards must be square without shape=(height, width), got {cells} numbers."
+        )
     height, width = (side, side) if shape is None else shape
     tiles = {str(tile): tile for tile in range(cells)}
     boards = []
     for number, words in lines:
         board = [tiles.get(word, -1) for word in words]
         if len(board) != cells or -1 in board or len(set(board)) != cells:
-            raise ValueError(f"{name}, line {number}: each of 0 to {cells - 1} once is expected, not {_short(words)}")
+            raise ValueError(
+                f"{name}, line {number}: each of 0 to {cells - 1} must be there once, got {' '.join(words)[:80]!r}."
+            )
         boards.append(board)
     return np.array(boards, dtype=np.uint8).reshape(-1, height, width)
 
@@ -157,13 +159,8 @@ def read_tiles(path: str | Path, shape: tuple[int, int] | None = None) -> Boards
 def board_shape(shape: Sequence[int]) -> tuple[int, int]:
     """Height and width; ValueError for what is none."""
     if not isinstance(shape, Sequence) or len(shape) != 2 or not all(isinstance(n, int) and n > 0 for n in shape):
-        raise ValueError(f"shape: height and width, integers of at least 1, are expected, not {shape!r}")
+        raise ValueError(f"`shape` must be height and width, integers of at least 1, got {shape!r}.")
     return shape[0], shape[1]
-
-
-def _short(words: list[str]) -> str:
-    text = " ".join(words)
-    return repr(text if len(text) <= 80 else text[:77] + "...")
 
 
 def _text_of(path_or_text: str | Path) -> tuple[str, str]:
@@ -176,9 +173,9 @@ def _text_of(path_or_text: str | Path) -> tuple[str, str]:
         try:
             content = lzma.decompress(content)
         except (lzma.LZMAError, EOFError) as error:
-            raise ValueError(f"{path}: it is no whole .xz file ({error})") from error
+            raise ValueError(f"{path}: it must be a whole .xz file, got one that is not: {error}") from error
     try:
         return str(path), content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
-        raise ValueError(f"{path}, line {line}: UTF-8 is expected, not byte {content[error.start]:#04x}") from error
+        raise ValueError(f"{path}, line {line}: it must be UTF-8, got byte {content[error.start]:#04x}.") from error

@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from neuroprior._checks import check_count, is_integer
 from neuroprior._random import generator_on
-from neuroprior.puzzles.worlds.puzzle import Observation, PuzzleWorld, board_tensor, reflected
+from neuroprior.puzzles.worlds.puzzle import PuzzleWorld, board_tensor, reflected
 from neuroprior.puzzles.worlds.reading import MOST_TILES, board_shape, read_tiles
 from neuroprior.puzzles.worlds.windows import CODES, Window, Windows, windows_within
 
@@ -19,41 +20,45 @@ class SlidingTilesWorld(PuzzleWorld):
     moves.
 
     In patterns a tile counts as how far it is from its place in the goal, in rows and columns, so that what is learned
-    of one tile holds for others. Planes are the blank and the tiles.
+    of one tile holds for others.
 
     Args:
         boards: uint8 `[n, H, W]`; None: `reset` scrambles the goal.
         goal: uint8 `[H, W]`.
-        windows, observation: see `PuzzleWorld`.
+        windows: whose patterns are observed.
         scramble: number of random moves.
 
     Raises:
         ValueError: the goal cannot be reached from a board; the message says which.
     """
 
-    def __init__(
-        self,
-        boards: Tensor | None,
-        goal: Tensor,
-        windows: Sequence[Window],
-        observation: Observation,
-        scramble: int,
-    ) -> None:
+    def __init__(self, boards: Tensor | None, goal: Tensor, windows: Sequence[Window], scramble: int) -> None:
         height, width = goal.shape
-        kinds = _num_kinds(height, width)
-        super().__init__(boards, (height, width), Windows(windows, kinds, 0), observation)
-        self.goal, self.scramble, self.num_planes = goal, scramble, height * width
+        self.goal, self.scramble = goal, scramble
+        flat = goal.flatten().cpu().numpy()
+        self.blank = int(flat.argmin())
+        # From each cell to each tile's place, [tiles, cells].
+        place, cell = flat.argsort()[:, None], np.arange(len(flat))
+        rows, columns = place // width - cell // width, place % width - cell % width
+        distances = (abs(rows) + abs(columns)).astype(np.float64)
+        # 1 for the tile that must go furthest up and left, and so on, row by row; 0 lies outside of the board.
+        kinds = 1 + (rows + height - 1) * (2 * width - 1) + columns + width - 1
+        super().__init__(
+            boards,
+            (height, width),
+            Windows(windows, _num_kinds(height, width)),
+            kinds=kinds,
+            outside=0,
+            goal=flat,
+            distances=distances,
+        )
         if boards is not None:
             wrong = (~_solvable(boards, goal)).nonzero()
             if len(wrong):
                 raise ValueError(
-                    f"boards[{int(wrong[0])}]: the goal cannot be reached from this board (without goal= it is 0, 1, 2,"
-                    " ... row by row)"
+                    f"`boards[{int(wrong[0])}]` must be a board from which the goal can be reached (without goal= it is"
+                    " 0, 1, 2, ... row by row), got one from which it cannot."
                 )
-
-    @property
-    def device(self) -> torch.device:
-        return self.goal.device
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         """Random boards of those given, or the goal after random legal moves: uint8 `[batch_size, H, W]`."""
@@ -64,76 +69,16 @@ class SlidingTilesWorld(PuzzleWorld):
         state = self.goal.expand(batch_size, *self.goal.shape).contiguous()
         for _ in range(self.scramble if batch_size else 0):
             action = torch.multinomial(self.legal_actions(state).float(), 1, generator=generator)[:, 0]
-            state = self._after(state, action)
+            state, _ = self._step(state, action, absorbing=False)
         return state
 
-    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-        """The blank moves; an illegal action, and any action where the goal is reached, leaves the state as it is.
-
-        The reward is 1 for the step that reaches the goal, else 0.
-        """
-        ended = self.solved(state)
-        after = torch.where(ended[:, None, None], state, self._after(state, action))
-        return after, (self.solved(after) & ~ended).float()
-
-    def _after(self, state: Tensor, action: Tensor) -> Tensor:
-        """Boards after a move of the blank, if it is legal."""
-        flat = state.flatten(1)
-        blank = _blank(flat)
-        width = state.shape[2]
-        legal = self.legal_actions(state).gather(1, action[:, None])[:, 0]
-        move = torch.tensor([-width, width, -1, 1], device=state.device)[action]
-        to = torch.where(legal, blank + move, blank)
-        tile = flat.gather(1, to[:, None])
-        return flat.scatter(1, blank[:, None], tile).scatter(1, to[:, None], 0).view_as(state)
-
-    def legal_actions(self, state: Tensor) -> Tensor:
-        """Moves of the blank that stay on the board: `[N, 4]` bool."""
-        height, width = state.shape[1:]
-        blank = _blank(state.flatten(1))
-        row, column = blank // width, blank % width
-        return torch.stack([row > 0, row < height - 1, column > 0, column < width - 1], 1)
+    @property
+    def device(self) -> torch.device:
+        return self.goal.device
 
     def solved(self, state: Tensor) -> Tensor:
         """Where the board is the goal."""
         return (state == self.goal).flatten(1).all(1)
-
-    def mover(self, state: Tensor) -> Tensor:
-        return _blank(state.flatten(1))
-
-    def kinds(self, state: Tensor) -> Tensor:
-        """1 for the tile that must go furthest up and left, and so on, row by row; 0 lies outside of the board."""
-        flat = state.flatten(1).long()
-        return self.tile_kinds()[flat, torch.arange(flat.shape[1], device=state.device)].view_as(state)
-
-    def tile_kinds(self) -> Tensor:
-        """The kind of each tile in each cell, int64 `[tiles, cells]`."""
-        height, width = self.goal.shape
-        cell, place = torch.arange(height * width, device=self.device), self._places()[:, None]
-        down = place.div(width, rounding_mode="floor") - cell.div(width, rounding_mode="floor") + height - 1
-        return 1 + down * (2 * width - 1) + place % width - cell % width + width - 1
-
-    def planes(self, state: Tensor) -> Tensor:
-        """One plane for the blank and each tile."""
-        return torch.nn.functional.one_hot(state.long(), self.goal.numel()).permute(0, 3, 1, 2).float()
-
-    def distances(self) -> Tensor:
-        """The rows and columns from each cell to each tile's place, int64 `[tiles, cells]`; 0 for the blank."""
-        width = self.goal.shape[1]
-        cell, place = torch.arange(self.goal.numel(), device=self.device), self._places()[:, None]
-        rows = (place.div(width, rounding_mode="floor") - cell.div(width, rounding_mode="floor")).abs()
-        far = rows + (place % width - cell % width).abs()
-        far[0] = 0
-        return far
-
-    def _places(self) -> Tensor:
-        """The cell of each tile in the goal, int64 `[tiles]`."""
-        return self.goal.flatten().long().argsort()
-
-    def lower_bound(self, state: Tensor) -> Tensor:
-        """The sum of the tiles' Manhattan distances from their places in the goal, int64 `[N]`: consistent."""
-        tiles = state.flatten(1).long()
-        return self.distances()[tiles, torch.arange(tiles.shape[1], device=state.device)].sum(1)
 
     def check_state(self, state: Tensor) -> None:
         super().check_state(state)
@@ -141,14 +86,13 @@ class SlidingTilesWorld(PuzzleWorld):
 
     def symmetries(self) -> int:
         """Two for square boards whose blank belongs on the diagonal, which can be transposed; else one."""
-        (height, width), blank = self.goal.shape, int(self._places()[0])
-        return 2 if height == width and blank // width == blank % width else 1
+        height, width = self.shape
+        return 2 if height == width and self.blank // width == self.blank % width else 1
 
     def transformed(self, state: Tensor, number: int) -> Tensor:
         if number == 0:
             return state
-        size = self.goal.numel()
-        renamed = torch.arange(size, device=self.device)
+        renamed = torch.arange(self.goal.numel(), device=self.device)
         renamed[self.goal.flatten().long()] = self.goal.transpose(0, 1).flatten().long()
         return renamed[reflected(state, 4).long()].to(torch.uint8)
 
@@ -186,7 +130,6 @@ def sliding_tiles(
     *,
     shape: tuple[int, int] | None = None,
     goal: Any = None,
-    observation: Observation = "patterns",
     windows: Sequence[Window] | None = None,
     scramble: int = 100,
 ) -> SlidingTilesWorld:
@@ -197,7 +140,6 @@ def sliding_tiles(
             of the tiles, 0 the blank; None: the goal is scrambled, and `shape` or `goal` is needed.
         shape: height and width.
         goal: integers `[H, W]`; None: 0, 1, 2, ... row by row.
-        observation: see `PuzzleWorld`.
         windows: of the patterns; None: `tile_windows`.
         scramble: number of random moves from the goal, where there are no boards.
 
@@ -220,38 +162,33 @@ def sliding_tiles(
         if shape is not None and given.dim() == 2 and given.shape[1] == shape[0] * shape[1]:
             given = given.view(-1, *shape)
         if given.dim() != 3 or 0 in given.shape or (shape is not None and given.shape[1:] != shape):
-            wanted = "[n, H, W], or [n, H * W] with shape=(H, W)," if shape is None else f"[n, {shape[0]}, {shape[1]}]"
-            raise ValueError(f"boards: shape {wanted} is expected, not {list(given.shape)}")
-        shape = (given.shape[1], given.shape[2])
-    if goal is None:
-        if shape is None:
-            raise ValueError("sliding_tiles: give boards, shape or goal")
-        goal = torch.arange(shape[0] * shape[1]).view(shape)
-    goal = board_tensor("goal", goal)
-    if goal.dim() != 2 or (shape is not None and goal.shape != shape):
-        raise ValueError(
-            f"goal: shape {'[H, W]' if shape is None else list(shape)} is expected, not {list(goal.shape)}"
-        )
-    if not 2 <= goal.numel() <= MOST_TILES:
-        raise ValueError(f"goal: a board of 2 to {MOST_TILES} cells is expected, not {goal.numel()}")
-    _check_permutations("goal", goal[None])
-    if given is not None:
+            wanted = "[n, H, W], or [n, H * W] with shape=(H, W)" if shape is None else f"[n, {shape[0]}, {shape[1]}]"
+            raise ValueError(f"`boards` must have the shape {wanted}, got {list(given.shape)}.")
         _check_permutations("boards", given)
-        given, goal = given.to(torch.uint8), goal.to(given.device)
-    height, width = goal.shape
-    windows = tile_windows(height, width) if windows is None else windows
-    return SlidingTilesWorld(given, goal.to(torch.uint8), windows, observation, scramble)
+        given, shape = given.to(torch.uint8), (given.shape[1], given.shape[2])
+    if goal is None and shape is None:
+        raise ValueError("`sliding_tiles` must be given boards, shape or goal, got none of them.")
+    goal = board_tensor("goal", torch.arange(shape[0] * shape[1]).view(shape) if goal is None and shape else goal)
+    if goal.dim() != 2 or (shape is not None and goal.shape != shape):
+        expected = "[H, W]" if shape is None else str(list(shape))
+        raise ValueError(f"`goal` must have the shape {expected}, got {list(goal.shape)}.")
+    if not 2 <= goal.numel() <= MOST_TILES:
+        raise ValueError(f"`goal` must be a board of 2 to {MOST_TILES} cells, got {goal.numel()}.")
+    _check_permutations("goal", goal[None])
+    goal = goal.to(torch.uint8) if given is None else goal.to(given.device, torch.uint8)
+    return SlidingTilesWorld(given, goal, tile_windows(*goal.shape) if windows is None else windows, scramble)
 
 
 def _check_permutations(name: str, boards: Tensor) -> None:
     """Raise ValueError unless each of `boards [n, H, W]` holds each tile once."""
     cells = boards.shape[1:].numel()
     if not is_integer(boards):
-        raise ValueError(f"{name}: integers are expected, not {str(boards.dtype).removeprefix('torch.')}")
+        raise ValueError(f"`{name}` must be integers, got {boards.dtype}.")
     wrong = (boards.flatten(1).long().sort(1).values != torch.arange(cells, device=boards.device)).any(1).nonzero()
     if len(wrong):
         which = name if name == "goal" else f"{name}[{int(wrong[0])}]"
-        raise ValueError(f"{which}: each of 0 to {cells - 1} once is expected")
+        tiles = boards[int(wrong[0])].flatten().tolist()
+        raise ValueError(f"`{which}` must hold each of 0 to {cells - 1} once, got {tiles}.")
 
 
 def _solvable(boards: Tensor, goal: Tensor) -> Tensor:
@@ -264,11 +201,6 @@ def _solvable(boards: Tensor, goal: Tensor) -> Tensor:
     # A move exchanges two tiles, which changes the parity of the permutation, and that of the blank's distance.
     inversions = sum((place[:, i, None] > place[:, i + 1 :]).sum(1) for i in range(place.shape[1]))
     width = goal.shape[1]
-    blank = _blank(boards.flatten(1))
+    blank = (boards.flatten(1) == 0).to(torch.uint8).argmax(1)
     away = (blank // width - order[0] // width).abs() + (blank % width - order[0] % width).abs()
     return (inversions + away) % 2 == 0
-
-
-def _blank(flat: Tensor) -> Tensor:
-    """int64 `[N]`: the cell of the blank in `flat [N, H * W]`."""
-    return (flat == 0).to(torch.uint8).argmax(1)

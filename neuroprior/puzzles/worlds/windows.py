@@ -1,9 +1,7 @@
 """Patterns: what lies in small windows around the mover of a puzzle, each pattern one number."""
 
 from collections.abc import Sequence
-
-import torch
-from torch import Tensor
+from itertools import accumulate
 
 Window = tuple[int, int, int, int]
 """The row and column of its first cell, counted from the mover, its height and its width."""
@@ -53,71 +51,39 @@ class Windows:
     Args:
         windows: see `Window`.
         base: number of kinds.
-        outside: the kind of what lies outside of the board.
 
     Attributes:
         num_codes: all codes are below it.
         radius: the rows or columns that windows reach away from the mover.
-        offsets: int64 `[F]`.
+        offsets: the code of each window whose cells are all of kind 0.
 
     Raises:
         ValueError: there are no windows, one of them is none, or they have 2**31 patterns or more together.
 
     Example:
-        >>> Windows(((0, 0, 2, 2),), base=3, outside=2).windows
-        ((0, 0, 2, 2),)
+        >>> Windows(((0, 0, 2, 2), (0, 0, 1, 1)), base=3).offsets
+        (0, 81)
     """
 
-    def __init__(self, windows: Sequence[Window], base: int, outside: int) -> None:
-        self.windows, self.base, self.outside = tuple(windows), base, outside
+    def __init__(self, windows: Sequence[Window], base: int) -> None:
+        self.windows, self.base = tuple(windows), base
         if not self.windows:
-            raise ValueError("windows: at least one is expected")
+            raise ValueError("`windows` must hold at least one window, got none.")
         for k, window in enumerate(self.windows):
-            whole = (
-                isinstance(window, Sequence) and len(window) == 4 and all(isinstance(number, int) for number in window)
-            )
+            whole = isinstance(window, Sequence) and len(window) == 4 and all(isinstance(n, int) for n in window)
             if not whole or min(window[2:]) < 1 or max(map(abs, window)) > FURTHEST:
                 raise ValueError(
-                    f"windows[{k}]: integers (row, column, height, width) are expected, height and width at least 1 and"
-                    f" none beyond {FURTHEST}, not {window!r}"
+                    f"`windows[{k}]` must be integers (row, column, height, width), height and width at least 1 and"
+                    f" none beyond {FURTHEST}, got {window!r}."
                 )
         sizes = [base ** (height * width) for _, _, height, width in self.windows]
-        self.num_codes = sum(sizes)
+        *offsets, self.num_codes = accumulate(sizes, initial=0)
+        self.offsets = tuple(offsets)
         if self.num_codes >= CODES:
             raise ValueError(
-                f"windows: they have {self.num_codes:,} patterns of {base} kinds of cells; fewer than 2**31 are"
-                " expected: take smaller or fewer windows"
+                f"`windows` must have fewer than 2**31 patterns, got {self.num_codes:,} of {base} kinds of cells."
+                " Take smaller or fewer windows."
             )
-        self.offsets = torch.tensor([0, *sizes]).cumsum(0)[:-1]
         self.radius = max(
             max(-row, -column, row + height - 1, column + width - 1) for row, column, height, width in self.windows
         )
-        # In the square around the mover, the cells of each window from its first; before them one that adds nothing.
-        side, most = 2 * self.radius + 1, max(height * width for _, _, height, width in self.windows)
-        self._cells = torch.full((most, len(self.windows)), side**2)
-        for k, (row, column, height, width) in enumerate(self.windows):
-            first = (self.radius + row) * side + self.radius + column
-            own = first + torch.arange(height)[:, None] * side + torch.arange(width)
-            self._cells[most - height * width :, k] = own.flatten()
-
-    def codes(self, kinds: Tensor, row: Tensor, column: Tensor) -> Tensor:
-        """The patterns around the mover.
-
-        Args:
-            kinds: integers `[N, H, W]` below `base`.
-            row, column: int64 `[N]`: where the mover is.
-
-        Returns:
-            int32 `[N, F]`.
-        """
-        reach, device = self.radius, kinds.device
-        around, each = torch.arange(2 * reach + 1, device=device), torch.arange(len(kinds), device=device)
-        padded = torch.nn.functional.pad(kinds.int(), (reach,) * 4, value=self.outside)
-        rows, columns = row[:, None] + around, column[:, None] + around
-        square = padded[each[:, None, None], rows[:, :, None], columns[:, None, :]].flatten(1)
-        square = torch.nn.functional.pad(square, (0, 1))  # and a cell of kind 0
-        first, *others = self._cells.to(device)
-        out = square.index_select(1, first)
-        for cells in others:
-            out.mul_(self.base).add_(square.index_select(1, cells))
-        return out.add_(self.offsets.to(device, torch.int32))

@@ -1,19 +1,19 @@
-"""The log-linear prior: closed forms, its optimum, and what it does with patterns that it does not know."""
+"""The log-linear prior: closed forms, its optimum, unknown patterns, and patterns in plans, files, worlds, planners."""
 
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from neuroprior import Plans
+from neuroprior import MarkovPrior, MCTSPlanner, Plans, SamplingPlanner, World, collect, read_plans, write_plans
 from neuroprior.priors import load, save
-from neuroprior.puzzles import LogLinearPrior, PatternNetwork, Steps
-
-
-def seeded(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
+from neuroprior.puzzles import LogLinearPrior, Steps
+from neuroprior.sampling.ancestral import sample_in_world
+from neuroprior.testing import check_world
+from tests.support.sources import seeded
 
 
 def random_plans(num: int = 200, length: int = 4, actions: int = 3, patterns: int = 2, codes: int = 6) -> Plans:
@@ -23,24 +23,9 @@ def random_plans(num: int = 200, length: int = 4, actions: int = 3, patterns: in
     return Plans((context.sum(-1) + noise) % actions, actions, context=context)
 
 
-def objective(prior: LogLinearPrior, plans: Plans) -> Tensor:
-    return -prior.log_prob(plans).mean() / plans.max_length
-
-
-def test_one_pattern_at_a_time_gives_the_frequencies() -> None:
-    plans = random_plans(patterns=1)
-    prior = LogLinearPrior(3, 1, use_last=False).fit(plans, generator=seeded(), epochs=400, l2=0.0)
-    assert plans.context is not None
-    for code in range(6):
-        there = plans.context[..., 0] == code
-        want = plans.actions[there].long().bincount(minlength=3) / there.sum()
-        got = prior.start(1, torch.tensor([[code]]))[0].softmax(-1)[0]
-        assert torch.allclose(got, want, atol=2e-2)
-
-
 def test_at_the_optimum_expected_and_observed_counts_of_patterns_are_equal() -> None:
     plans = random_plans()
-    prior = LogLinearPrior(3, 2).fit(plans, generator=seeded(), epochs=300, l2=0.0)
+    prior = LogLinearPrior(3, 2).fit(plans, generator=seeded(0), epochs=300, l2=0.0)
     assert plans.context is not None
     residual = prior(plans.actions, plans.context).softmax(-1) - torch.eye(3)[plans.actions.long()]
     for code in range(6):
@@ -52,30 +37,26 @@ def test_at_the_optimum_expected_and_observed_counts_of_patterns_are_equal() -> 
         assert float((after * residual[:, 1:]).mean((0, 1)).abs().max()) < 1e-2
 
 
+def test_without_known_patterns_actions_follow_the_last_one_as_often_as_they_did() -> None:
+    plans = Plans(torch.tensor([[0, 0, 1, 2]] * 30 + [[1, 0, 2, 2]] * 10), 3, context=random_plans(40).context)
+    prior = LogLinearPrior(3, 2, min_count=10**6).fit(plans, generator=seeded(0), epochs=300)
+    followers = torch.tensor([[30.0, 30, 10], [10, 0, 30], [0, 0, 10], [30, 10, 0]])  # the last: first actions
+    want = followers / followers.sum(1, keepdim=True)
+    for last in range(4):
+        probs = (prior.scores(torch.tensor([[0, 0]]))[0] + prior.after[last]).softmax(-1)
+        assert torch.allclose(probs, want[last], atol=3e-2)
+
+
 def test_patterns_that_are_rare_or_unknown_weigh_nothing() -> None:
     context = torch.tensor([[[5], [5], [9]]]).repeat(3, 1, 1)
     context[0, 0] = 7
     plans = Plans(torch.tensor([[0, 0, 1]] * 3), 2, context=context)
-    prior = LogLinearPrior(2, 1, use_last=False).fit(plans)
+    prior = LogLinearPrior(2, 1).fit(plans)
     assert prior.patterns.tolist() == [5, 9]
     assert prior.weights.shape == (3, 2)
     assert not prior.weights[-1].any()
-    assert prior.start(2, torch.tensor([[7], [2**31 - 1]]))[0].equal(prior.after[:2])
+    assert prior.start(2, torch.tensor([[7], [2**31 - 1]]))[0].equal(prior.after[-1:].expand(2, -1))
     assert LogLinearPrior(2, 1, min_count=1).fit(plans).patterns.tolist() == [5, 7, 9]
-
-
-@pytest.mark.parametrize("make", [LogLinearPrior, PatternNetwork])
-def test_without_last_actions_the_frequencies_of_actions_count(make: type[LogLinearPrior]) -> None:
-    plans = Plans(torch.tensor([[0, 0, 1, 2]] * 40), 3, context=random_plans(40).context)
-    prior = make(3, 2, use_last=False, min_count=10**6)  # no pattern is known
-    prior.fit(plans, generator=seeded(), epochs=200, l2=0.0)
-    assert plans.context is not None
-    for probs in prior(plans.actions, plans.context).softmax(-1).flatten(0, 1).unique(dim=0):
-        assert torch.allclose(probs, torch.tensor([0.5, 0.25, 0.25]), atol=2e-2)
-    # With patterns, too, the expected and the observed counts of actions are equal at the optimum.
-    prior = make(3, 2, use_last=False).fit(plans, generator=seeded(), epochs=200, l2=0.0)
-    means = prior(plans.actions, plans.context).softmax(-1).mean((0, 1))
-    assert torch.allclose(means, torch.tensor([0.5, 0.25, 0.25]), atol=1e-2)
 
 
 @pytest.mark.parametrize("min_count", [255, 256, 400, 401])
@@ -83,21 +64,19 @@ def test_patterns_may_have_to_be_common(min_count: int) -> None:
     context = torch.stack([torch.full((400, 1), 5), torch.arange(400)[:, None]])  # pattern 5 occurs 400 times
     context[1, 5] = 6
     plans = Plans(torch.arange(800).view(2, 400) % 3, 3, context=context)
-    prior = LogLinearPrior(3, 1, min_count=min_count).fit(plans, generator=seeded(), epochs=1)
+    prior = LogLinearPrior(3, 1, min_count=min_count).fit(plans, generator=seeded(0), epochs=1)
     assert prior.patterns.tolist() == ([5] if min_count <= 400 else [])
 
 
 def test_a_second_fit_goes_on_from_the_first() -> None:
     plans = random_plans()
     slow = {"epochs": 1, "learning_rate": 0.02}
-    once = LogLinearPrior(3, 2).fit(plans, generator=seeded(), **slow)
-    before = float(objective(once, plans))
-    again = LogLinearPrior(3, 2).fit(plans, generator=seeded(), **slow).fit(plans, generator=seeded(), **slow)
-    assert float(objective(again, plans)) < before
+    once = LogLinearPrior(3, 2).fit(plans, generator=seeded(0), **slow)
+    again = LogLinearPrior(3, 2).fit(plans, generator=seeded(0), **slow).fit(plans, generator=seeded(0), **slow)
+    assert float(again.log_prob(plans).mean()) > float(once.log_prob(plans).mean())
     assert plans.context is not None
     weights = once.weights[:-1].clone()
-    other = Plans(plans.actions, 3, context=plans.context + 4)
-    once.fit(other, epochs=1, learning_rate=1e-12)
+    once.fit(Plans(plans.actions, 3, context=plans.context + 4), epochs=1, learning_rate=1e-12)
     assert once.patterns.tolist() == [4, 5, 6, 7, 8, 9]
     assert torch.allclose(once.weights[:2], weights[4:], atol=1e-6)
     assert float(once.weights[2:].abs().max()) < 1e-6
@@ -105,75 +84,151 @@ def test_a_second_fit_goes_on_from_the_first() -> None:
 
 def test_levin_loss_decreases_its_objective() -> None:
     plans = random_plans(40)
-    prior = LogLinearPrior(3, 2).fit(plans, generator=seeded(), epochs=100)
+    prior = LogLinearPrior(3, 2).fit(plans, generator=seeded(0), epochs=100)
 
     def levin() -> float:
         return float((torch.tensor(4.0).log() - prior.log_prob(plans)).logsumexp(0))
 
     before = levin()
-    prior.fit(plans, generator=seeded(), loss="levin", epochs=20)
+    prior.fit(plans, generator=seeded(0), loss="levin", epochs=20)
     assert levin() < before - 1e-3
 
 
-def test_flat_steps_give_what_plans_give() -> None:
+def test_flat_steps_and_a_file_give_what_plans_give(tmp_path: Path) -> None:
     plans = random_plans()
     assert plans.context is not None
+    one = LogLinearPrior(3, 2).fit(plans, generator=seeded(0))
     last = torch.cat([torch.full((200, 1), 3), plans.actions[:, :-1].long()], 1)
-    one = LogLinearPrior(3, 2).fit(plans, generator=seeded())
     plan = torch.arange(200).repeat_interleave(4)
     steps = Steps(plans.context.flatten(0, 1), last.flatten(), plans.actions.flatten().long(), plan)
-    other = LogLinearPrior(3, 2).fit_steps(steps, generator=seeded())
-    assert one.weights.equal(other.weights)
-    assert one.after.equal(other.after)
-
-
-def test_the_same_seed_gives_the_same_prior() -> None:
-    plans = random_plans()
-    first, second = (LogLinearPrior(3, 2).fit(plans, generator=seeded(5)) for _ in range(2))
-    assert first.weights.equal(second.weights)
-
-
-@pytest.mark.parametrize("use_last", [False, True])
-def test_saved_and_loaded(use_last: bool, tmp_path: Path) -> None:
-    plans = random_plans()
-    prior = LogLinearPrior(3, 2, use_last=use_last).fit(plans, generator=seeded())
-    copy = load(save(prior, tmp_path))
-    assert isinstance(copy, LogLinearPrior)
-    assert copy.config == {"num_actions": 3, "num_patterns": 2, "use_last": use_last, "min_count": 2}
-    assert copy.patterns.dtype == torch.int32
-    assert copy.log_prob(plans).equal(prior.log_prob(plans))
-
-
-def test_bad_input_is_refused() -> None:
-    prior = LogLinearPrior(3, 2)
-    plans = random_plans()
-    for context in (torch.rand(200, 4, 2), plans.context[..., :1], None, plans.actions.long()):  # type: ignore[index]
-        with pytest.raises(ValueError, match="context"):
-            prior.fit(Plans(plans.actions, 3, context=context))
-    with pytest.raises(ValueError, match=r"context\[0, 1, 1\]: -1 is out of range"):
-        Plans(torch.zeros(1, 2, dtype=torch.long), 3, context=torch.tensor([[[0, 1], [3, -1]]]))
-    for settings in ({"loss": "square"}, {"epochs": 0}, {"l2": -1.0}, {"learning_rate": 0.0}, {"steps": 3}):
-        with pytest.raises(ValueError, match=next(iter(settings))):
-            prior.fit(plans, **settings)
-    for settings in ({"learning_rate": math.inf}, {"learning_rate": 1e30}, {"l2": math.inf}):
-        with pytest.raises(ValueError, match="become infinite"):
-            prior.fit(plans, **settings)
-    assert prior.log_prob(plans).isfinite().all()
-    for wrong in (torch.zeros(1, 2), torch.zeros(1, 3, dtype=torch.int32), torch.zeros(1, 1, 2, dtype=torch.int32)):
-        with pytest.raises(ValueError, match="context: 2 patterns"):
-            prior.start(1, wrong)
-    steps = Steps(
-        torch.zeros(2, 2, dtype=torch.int32), torch.tensor([0, 4]), torch.tensor([0, 1]), torch.tensor([0, 0])
-    )
-    with pytest.raises(ValueError, match="last"):
-        prior.fit_steps(steps)
+    other = LogLinearPrior(3, 2).fit_steps(steps, generator=seeded(0))
+    copy = load(save(one, tmp_path))
+    assert copy.config == {"num_actions": 3, "num_patterns": 2, "min_count": 2}
+    for same in (other, copy):
+        assert isinstance(same, LogLinearPrior)
+        assert same.patterns.dtype == torch.int32
+        assert same.weights.equal(one.weights)
+        assert same.after.equal(one.after)
 
 
 def test_actions_are_remembered_without_a_new_context() -> None:
-    prior, patterns = LogLinearPrior(2, 1), torch.tensor([[0]])
+    prior = LogLinearPrior(2, 1)
     prior.after[:, 0] = torch.arange(3.0)
-    logits, state = prior.start(1, patterns)
+    logits, state = prior.start(1, torch.tensor([[0]]))
     assert float(logits[0, 0]) == 2  # no action yet
     for action in (1, 0, 1):
         logits, state = prior.step(torch.tensor([action]), state)
         assert float(logits[0, 0]) == action
+
+
+class Line(World):
+    """Cells 0 to 9 of a line, on which the agent steps left or right; the patterns are its cell and its half."""
+
+    num_actions = 2
+
+    def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
+        return torch.randint(10, (batch_size,), generator=generator)
+
+    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        reached = (state + 2 * action - 1).clamp(0, 9)
+        return reached, (reached == 9).float()
+
+    def observe(self, state: Tensor) -> Tensor:
+        return torch.stack([state, 100 + state // 5], 1).to(torch.int32)
+
+
+def to_the_middle() -> Plans:
+    """Plans that go right from the left half, and left from the right half."""
+    world, state, actions, seen = Line(), torch.arange(10).repeat(20), [], []
+    for _ in range(6):
+        seen.append(world.observe(state))
+        actions.append((state < 5).long())
+        state = world.step(state, actions[-1])[0]
+    return Plans(torch.stack(actions, 1), 2, context=torch.stack(seen, 1))
+
+
+def test_it_acts_in_a_world_of_patterns() -> None:
+    world, start = Line(), torch.tensor([0, 9])
+    check_world(world)
+    prior = LogLinearPrior(2, 2).fit(to_the_middle(), generator=seeded(0))
+    plans, _ = sample_in_world(prior, world, start, 200, 3, generator=seeded(1))
+    # At least 0.95 of the steps go towards the middle, as all steps of the plans that were learned from.
+    assert float(plans[0].float().mean()) > 0.95
+    assert float(plans[1].float().mean()) < 0.05
+    for planner in (SamplingPlanner(prior, 4, 8), MCTSPlanner(prior, 4, 16)):
+        assert planner.plan(world, start, seeded(2)).plan.shape == (2, 4)
+    collected = collect(SamplingPlanner(MarkovPrior(2, 0), 4, 8), world, state=start, context="step")
+    assert collected.context is not None
+    assert collected.context[:, 0].equal(world.observe(start))
+
+
+def test_plans_keep_patterns(tmp_path: Path) -> None:
+    plans = to_the_middle()
+    assert plans.context is not None
+    write_plans(plans, tmp_path / "plans.npz")
+    cut, ended, again = plans[3:5].steps(1, 4), plans.with_end(), read_plans(tmp_path / "plans.npz")
+    wide = Plans(plans.actions, 2, context=plans.context.long())
+    for kept, due in (
+        (again, plans.context),
+        (wide, plans.context),
+        (cut, plans.context[3:5, 1:4]),
+        (ended.steps(6, 7), plans.context[:, -1:]),
+    ):
+        assert kept.context is not None
+        assert kept.context.dtype == torch.int32
+        assert kept.context.equal(due)
+    for suffix in ("csv", "jsonl"):
+        with pytest.raises(ValueError, match="npz"):
+            write_plans(plans, tmp_path / f"plans.{suffix}")
+    assert LogLinearPrior(3, 2).fit(ended).end == 2
+
+
+PLANS = random_plans()
+
+
+@pytest.mark.parametrize("context", [torch.rand(200, 4, 2), PLANS.context[..., :1], None, PLANS.actions.long()])  # type: ignore[index]
+def test_plans_without_its_patterns_are_refused(context: Any) -> None:
+    with pytest.raises(ValueError, match="context"):
+        LogLinearPrior(3, 2).fit(Plans(PLANS.actions, 3, context=context))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"loss": "square"}, '`loss` must be "log" or "levin"'),
+        ({"epochs": 0}, "epochs"),
+        ({"l2": -1.0}, "`l2` must be at least 0, got -1.0"),
+        ({"learning_rate": 0.0}, "`learning_rate` must be above 0"),
+        ({"steps": 3}, "steps"),
+        ({"learning_rate": math.inf}, "weights stay finite"),
+        ({"l2": math.inf}, "weights stay finite"),
+    ],
+)
+def test_settings_out_of_range_are_refused_and_change_nothing(settings: dict[str, Any], message: str) -> None:
+    prior = LogLinearPrior(3, 2)
+    with pytest.raises(ValueError, match=message):
+        prior.fit(PLANS, **settings)
+    assert not prior.after.any()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: LogLinearPrior(2, 0), "num_patterns"),
+        (lambda: LogLinearPrior(3, 2).start(1, torch.zeros(1, 2)), "`context` must be 2 patterns"),
+        (lambda: LogLinearPrior(3, 2).start(1, torch.zeros(1, 3, dtype=torch.int32)), "`context` must be 2 patterns"),
+        (lambda: LogLinearPrior(3, 2).start(1), "`context` must be 2 patterns"),
+        (
+            lambda: LogLinearPrior(3, 1).fit_steps(
+                Steps(torch.zeros(2, 1, dtype=torch.int32), torch.tensor([0, 4]), torch.arange(2), torch.arange(2))
+            ),
+            "last",
+        ),
+        (lambda: MarkovPrior(2, 1, num_contexts=200).fit(to_the_middle()), "patterns"),
+        (lambda: sample_in_world(LogLinearPrior(2, 3), Line(), torch.tensor([1]), 1, 2), "3 patterns"),
+        (lambda: LogLinearPrior(3, 2).sample(3, 2, PLANS.context[:3, 0]), r"context: .*\[3, 2\]"),  # type: ignore[index]
+    ],
+)
+def test_bad_input_is_refused(call: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()

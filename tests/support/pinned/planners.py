@@ -53,12 +53,12 @@ def searches():
         state = world.reset(4, seeded(3))
         moves = MarkovPrior(4, 1).fit(torch.randint(4, (30, 5), generator=seeded(0)))
         for kind, planner in {
-            "levin": LevinPlanner(moves, 300, compile=False),
-            "rerooted": LevinPlanner(moves, 300, reroot=True, compile=False),
-            "informed": LevinPlanner(moves, 300, heuristic=world.lower_bound, temperature=1.5, compile=False),
-            "a star": AStarPlanner(world.lower_bound, 1.0, 300, compile=False),
-            "weighted": AStarPlanner(world.lower_bound, 2.0, 300, nodes_at_once=2, compile=False),
-            "blind": AStarPlanner(None, 1.0, 200, compile=False),
+            "levin": LevinPlanner(moves, 300),
+            "rerooted": LevinPlanner(moves, 300, reroot=True),
+            "informed": LevinPlanner(moves, 300, heuristic=world.lower_bound, temperature=1.5),
+            "a star": AStarPlanner(world.lower_bound, 1.0, 300),
+            "weighted": AStarPlanner(world.lower_bound, 2.0, 300),
+            "blind": AStarPlanner(None, 1.0, 200),
         }.items():
             found[f"{kind}, {name}"] = planner.search(world, state)
     table = cube("half", scramble=3)

@@ -34,7 +34,7 @@ from neuroprior.priors import (
 )
 from neuroprior.priors.fitting import PRIORS
 from neuroprior.priors.macros import CRITERIA
-from neuroprior.puzzles import BoardNetwork, LogLinearPrior, PatternCounts, PatternNetwork, Steps
+from neuroprior.puzzles import LogLinearPrior, Steps
 from tests.support.pinned.data import behaviour, timed
 from tests.support.sources import seeded
 from tests.support.unchanged import case
@@ -208,18 +208,13 @@ def patterns():
     plans, found = behaviour(30, context="step"), {}
     place, last = plans.context, plans.actions.long().roll(1, 1)
     plans = replace(plans, context=torch.stack([place, 3 + last, 6 + (place + last) % 4], -1))
-    board = replace(plans, context=torch.nn.functional.one_hot(plans.context[..., :2].long(), 6).float().flatten(2))
     for name, prior, how in (
         ("log-linear", LogLinearPrior(3, 3), {}),
-        ("log-linear, levin", LogLinearPrior(3, 3, use_last=False, min_count=5), {"loss": "levin", "epochs": 2}),
-        ("product", PatternCounts(3, 3), {}),
-        ("back-off", PatternCounts(3, 3, combine="backoff", smoothing=0.5), {}),
-        ("network", PatternNetwork(3, 3, size=4, depth=2), {"epochs": 2}),
+        ("log-linear, levin", LogLinearPrior(3, 3, min_count=5), {"loss": "levin", "epochs": 2}),
     ):
         found[name] = of_prior(prior.fit(plans, generator=seeded(0), **how), plans)
     steps = Steps(plans.context[:6, 1], plans.actions[:6, 0].long(), plans.actions[:6, 1].long(), torch.arange(6) // 2)
     found["steps"] = LogLinearPrior(3, 3).fit_steps(steps, generator=seeded(0)).scores(plans.context[:4, 0].long())
-    found["board"] = of_prior(BoardNetwork(3, (2, 2, 3), 4, 1).fit(board, generator=seeded(0), epochs=2), board)
     return found
 
 
