@@ -11,7 +11,7 @@ from neuroprior.control.planners.vector_planner import (
     Proposal,
     VectorDecision,
     VectorPlanner,
-    filled,
+    fill_plan,
     middle_and_half,
 )
 from neuroprior.control.worlds.continuous_world import ContinuousWorld
@@ -67,7 +67,7 @@ class ShootingPlanner(VectorPlanner):
         generator, memory = self.begin(world, state, generator, memory)
         middle, half = middle_and_half(world, state.device)
         last = memory.mean if self.warm_start else None
-        mean = filled(last, len(state), self.length, middle, repeat=True)
+        mean = fill_plan(last, len(state), self.length, middle, repeat=True)
         # A single candidate is drawn: else the plan would never change.
         again = last is not None and self.num_plans > 1
         drawn = self.num_plans - again

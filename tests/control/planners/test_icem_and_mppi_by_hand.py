@@ -81,39 +81,33 @@ def test_icem_is_the_algorithm_over_several_decisions(number, beta):
 
 @pytest.mark.parametrize("cost", [False, True])
 @pytest.mark.parametrize(("temperature", "normalise"), [(0.5, False), (20.0, False), (0.3, True)])
-@pytest.mark.parametrize("iterations", [1, 3])
-def test_mppi_is_the_algorithm_over_several_decisions(cost, temperature, normalise, iterations):
+def test_mppi_is_the_algorithm_over_several_decisions(cost, temperature, normalise):
     """Algorithm 2 of Williams et al. (2017): weights exp(-(S - min S) / lambda), S with lambda u' Sigma^-1 e."""
     world = Cart()
     low, high, middle, half = bounds(world)
-    settings = {"temperature": temperature, "normalise": normalise, "control_cost": cost, "iterations": iterations}
-    planner = MPPIPlanner(LENGTH, 12, std=0.6, **settings)
+    planner = MPPIPlanner(LENGTH, 12, std=0.6, temperature=temperature, normalise=normalise, control_cost=cost)
     sigma, mean = 0.6 * half, np.tile(middle, (LENGTH, 1))
     state, memory, ours, theirs = world.reset(1, seeded(5)), None, seeded(6), seeded(6)
     for number in range(3):
         decision = planner.plan(world, state, ours, memory)
-        highest = -np.inf
-        for _ in range(iterations):
-            noise = sigma * torch.randn(12 // iterations, LENGTH, 2, generator=theirs).numpy()
-            plans = np.clip(mean + noise, low, high)
-            values = score(world, state[0], plans)
-            highest = max(highest, values.max())
-            loss = -values / (values.std() if normalise else 1)
-            if cost:
-                loss = loss + temperature * ((mean - middle) / sigma**2 * (plans - mean)).sum((1, 2))
-            weights = np.exp(-(loss - loss.min()) / temperature)
-            mean = mean + np.einsum("k,ktd->td", weights / weights.sum(), plans - mean)
+        plans = np.clip(mean + sigma * torch.randn(12, LENGTH, 2, generator=theirs).numpy(), low, high)
+        values = score(world, state[0], plans)
+        loss = -values / (values.std() if normalise else 1)
+        if cost:
+            loss = loss + temperature * ((mean - middle) / sigma**2 * (plans - mean)).sum((1, 2))
+        weights = np.exp(-(loss - loss.min()) / temperature)
+        mean = mean + np.einsum("k,ktd->td", weights / weights.sum(), plans - mean)
         # The rounding of float32 is carried on from average to average.
-        np.testing.assert_allclose(decision.plan[0], mean, atol=1e-5 if number or iterations > 1 else 1e-6)
-        np.testing.assert_allclose(decision.score[0], highest, rtol=1e-5)
+        np.testing.assert_allclose(decision.plan[0], mean, atol=1e-5 if number else 1e-6)
+        np.testing.assert_allclose(decision.score[0], values.max(), rtol=1e-5)
         action = decision.plan[:, :1]
         memory = decision.memory.moved_on(action, world.observe(state)[:, None], planner.keep)
         state, _ = world.step(state, action[:, 0])
         mean = np.concatenate([mean[1:], middle[None]])
 
 
-@pytest.mark.parametrize(("first", "elites", "keep"), [(40, 10, 0.3), (16, 4, 0.5)])
-def test_icem_decides_as_its_authors_program(first, elites, keep, monkeypatch):
+@pytest.mark.parametrize(("first", "elites", "kept"), [(40, 10, 3), (16, 4, 1)])
+def test_icem_decides_as_its_authors_program(first, elites, kept, monkeypatch):
     """The bookkeeping of martius-lab/iCEM, re-stated: shifted elites are more candidates than the first population,
     the mean takes the place of a candidate, and the decision is the best of the last iteration."""
     world, alpha = Cart(), 0.1
@@ -121,7 +115,7 @@ def test_icem_decides_as_its_authors_program(first, elites, keep, monkeypatch):
     sizes = [first]
     while len(sizes) < 3:
         sizes.append(max(2 * elites, int(sizes[-1] / 1.25)))
-    planner = ICEMPlanner(LENGTH, sum(sizes), elites=elites, keep_elites=keep)
+    planner = ICEMPlanner(LENGTH, sum(sizes), elites=elites)
     drawn = []
 
     def recorded(shape, beta, generator):
@@ -145,11 +139,11 @@ def test_icem_decides_as_its_authors_program(first, elites, keep, monkeypatch):
                 plans = np.concatenate([mean[None], plans])
             if i == 0 and pool is not None:
                 ends = np.clip(mean + std * of_shifted, low, high)[:, -1:]
-                plans = np.concatenate([plans, np.concatenate([pool[: int(elites * keep), 1:], ends], 1)])
+                plans = np.concatenate([plans, np.concatenate([pool[:kept, 1:], ends], 1)])
             costs = -score(world, state[0], plans)
             if i:
-                plans = np.concatenate([plans, pool[: int(elites * keep)]])
-                costs = np.concatenate([costs, values[: int(elites * keep)]])
+                plans = np.concatenate([plans, pool[:kept]])
+                costs = np.concatenate([costs, values[:kept]])
             order = costs.argsort()[:elites]
             pool, values = plans[order], costs[order]
             mean = (1 - alpha) * pool.mean(0) + alpha * mean

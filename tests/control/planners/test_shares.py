@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from neuroprior.control import ICEMPlanner, Memory, MPPIPlanner, ShootingPlanner, control
-from neuroprior.control.planners.shares import KEPT, Shares
+from neuroprior.control.planners.shares import KEPT_PER_DECISION, Shares
 from tests.support.sources import refuses, seeded
 from tests.support.vectors import Cart, drift
 
@@ -68,7 +68,7 @@ def test_a_kind_wins_where_one_of_its_candidates_is_the_best_of_all(scores, othe
     assert shares.wins.tolist() == [[[won[0], 2.0], [won[1], 4.0]]]
     assert not shares.wins.requires_grad
     later = Shares([6], 1 / 3, 1, seeded(0), adapt=True, wins=shares.wins)
-    assert torch.allclose(later.wins, KEPT * shares.wins)
+    assert torch.allclose(later.wins, KEPT_PER_DECISION * shares.wins)
 
 
 def test_decisions_with_one_kind_of_candidates_say_nothing():
@@ -208,7 +208,7 @@ def test_wins_go_with_the_run_and_must_fit_it():
     assert moved.wins.equal(memory.wins)
     assert moved.rows(torch.tensor([4, 1])).wins.equal(memory.wins[[4, 1]])
     assert control(planner, world, state, 4, seeded(1)).plans.lengths.tolist() == [2, 4] * 3
-    with refuses("memory: wins of shape [6, 2, 2] is expected, not [3, 2, 2]"):
+    with refuses("`memory.wins` must have shape [6, ..., 2], got [3, 2, 2]"):
         planner.plan(world, state, seeded(0), memory._replace(wins=memory.wins[:3]))
 
 
@@ -295,14 +295,3 @@ def test_the_first_iteration_has_candidates_of_both_kinds(share):
         assert all(0 <= count <= size for count, size in zip(counts, drawn, strict=True))
         total = sum(drawn)
         assert sum(counts) == min(max(round(share * total), 1), total - 1)
-
-
-def test_arguments_of_shares():
-    with refuses("share", "a number from 0 to 1", "1.5"):
-        Shares([4], 1.5, 1, seeded(0))
-    with refuses("drawn", "-1"):
-        Shares([4, -1], 0.5, 1, seeded(0))
-    with refuses("batch_size", "-2"):
-        Shares([4], 0.5, -2, seeded(0))
-    with refuses("wins", "[3, 2, 2]", "[1, 1, 2]"):
-        Shares([4], 0.5, 3, seeded(0), adapt=True, wins=wins(1, 2)[None])

@@ -121,15 +121,14 @@ def test_links_inside_obstacles_cost_their_depth():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (partial(DoubleIntegrator, 0), "num_dimensions: an integer of at least 1"),
-        (partial(DoubleIntegrator, mass=0.0), "mass: a finite number above 0"),
-        (partial(DoubleIntegrator, mass="heavy"), "mass: a finite number above 0"),
-        (partial(DoubleIntegrator, force_cost=-1.0), "force_cost: a finite number of at least 0"),
-        (partial(DoubleIntegrator, goal=(1.0, math.nan)), "goal: 2 finite numbers"),
-        (partial(PlanarArm, masses=math.inf), "masses: a finite number above 0"),
-        (partial(PlanarArm, goal=(1.0,)), "goal: 2 finite numbers"),
-        (partial(PlanarArm, obstacles=((0.0, 1.0),)), r"obstacles\[0\]: 3 finite numbers"),
-        (partial(PlanarArm, obstacles=((0.0, 1.0, 0.0),)), "obstacles: radii above 0"),
+        (partial(DoubleIntegrator, 0), "num_dimensions"),
+        (partial(DoubleIntegrator, mass=0.0), "`mass` must be finite and above 0, got 0.0"),
+        (partial(DoubleIntegrator, mass="heavy"), "`mass` must be finite and above 0, got 'heavy'"),
+        (partial(PlanarArm, masses=math.inf), "`masses` must be finite and above 0, got inf"),
+        (partial(DoubleIntegrator, force_cost=-1.0), "`force_cost` must be finite and at least 0, got -1.0"),
+        (partial(DoubleIntegrator, goal=(1.0, math.nan)), "`goal` must be 2 finite numbers, got .*nan"),
+        (partial(PlanarArm, obstacles=((0.0, 1.0),)), r"`obstacles\[0\]` must be 3 finite numbers"),
+        (partial(PlanarArm, obstacles=((0.0, 1.0, 0.0),)), "`obstacles` must have radii above 0"),
     ],
 )
 def test_wrong_arguments(make, message):
