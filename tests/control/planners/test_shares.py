@@ -212,20 +212,6 @@ def test_wins_go_with_the_run_and_must_fit_it():
         planner.plan(world, state, seeded(0), memory._replace(wins=memory.wins[:3]))
 
 
-@pytest.mark.parametrize("make", PLANNERS)
-def test_rewards_that_are_all_equal_leave_the_share_as_it_is(make):
-    world = Preferring()
-    world.step = lambda state, action, generator=None: (state, torch.zeros(len(state)))
-    planner = make(2, 20, prior=drift(world, std=1e-9), prior_share=0.5)
-    state = world.reset(100, seeded(0))
-    memory = planner.plan(world, state, seeded(1)).memory._replace(mean=None, elites=None)
-    first = world.of_prior[0]
-    world.of_prior.clear()
-    memory = planner.plan(world, state, seeded(1), memory).memory
-    assert world.of_prior[0].equal(first)
-    assert not memory.wins[..., 0].any()
-
-
 @pytest.mark.parametrize("make", [ShootingPlanner, ICEMPlanner])
 def test_nobody_wins_where_what_was_planned_before_is_the_best(make):
     """Vectors far from the middle are good; what is left of the last plan, or the elites, are at the bounds."""
@@ -238,19 +224,6 @@ def test_nobody_wins_where_what_was_planned_before_is_the_best(make):
     for given, won in ((memory, 6), (with_best, 0)):
         planner = make(2, 12, prior=drift(world, std=1e-3), std=0.05)
         assert int(planner.plan(world, state, seeded(1), given).memory.wins[..., 0].sum()) == won
-
-
-@pytest.mark.parametrize("make", PLANNERS)
-def test_a_start_is_decided_alike_beside_any_others(make):
-    """Also where the others ask the prior for other numbers of candidates."""
-    world = Cart()
-    state = world.reset(5, seeded(0))
-    planner = make(4, 12, prior=drift(world))
-    memory = planner.plan(world, state, seeded(1)).memory
-    even, odd = (memory._replace(wins=wins(*each).expand(5, 2, 2).clone()) for each in (((1.0, 9.0), (9.0, 9.0)),) * 2)
-    odd.wins[1:] = wins((0.0, 90.0), (90.0, 90.0))
-    pair = [planner.plan(world, state, seeded(2), each).plan[0] for each in (even, odd)]
-    assert torch.allclose(*pair, atol=1e-6)
 
 
 def test_the_control_cost_is_that_of_own_candidates_where_shares_differ():
@@ -275,15 +248,6 @@ def test_the_control_cost_is_that_of_own_candidates_where_shares_differ():
         wanted = (weights[:, None, None] * tried).sum(0).float().clamp(world.action_low, world.action_high)
         assert torch.allclose(plan[run], wanted, atol=1e-5)
     assert counts[0] < counts[1]
-
-
-def test_no_runs_and_a_single_candidate():
-    world = Cart()
-    planner = ShootingPlanner(3, 1, prior=drift(world))
-    memory = Memory(torch.zeros(0, 1, 2), torch.zeros(0, 1, 3), wins=torch.zeros(0, 2, 2))
-    assert planner.plan(world, world.reset(0), seeded(0), memory).plan.shape == (0, 3, 2)
-    counts = Shares([1], 0.5, 100, seeded(0), adapt=True, wins=torch.zeros(100, 2, 2)).counts
-    assert not counts.any()  # as in the first decision
 
 
 @pytest.mark.parametrize("share", [0.01, 0.25, 0.5, 0.75, 0.9, 0.99])

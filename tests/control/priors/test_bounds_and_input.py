@@ -69,6 +69,12 @@ def test_ranges_that_float32_does_not_resolve_are_refused(low, high):
         VectorPlans(torch.full((1, 2, 1), 1000.0), [low], [high])
 
 
+def test_a_millionth_of_the_range_beyond_the_bounds_is_rounding():
+    assert float(VectorPlans(torch.full((1, 1, 1), 1 + 1.5e-6), [-1.0], [1.0]).actions) == 1
+    with pytest.raises(ValueError, match="`actions` must be between the bounds -1 and 1"):
+        VectorPlans(torch.full((1, 1, 1), 1 + 4e-6), [-1.0], [1.0])
+
+
 def test_bounds_are_compared_by_their_range():
     plans = VectorPlans(torch.full((2, 3, 1), 1000.5), [1000.0], [1001.0])
     with pytest.raises(ValueError, match="action_low"):
@@ -266,7 +272,8 @@ def test_what_never_changes_beside_others_does_not_borrow_their_spread(kind):
     moving = torch.randn(2, 12, 2, generator=seeded(0)).cumsum(1).mul(0.1).tanh()
     values = torch.cat([moving[..., :1], torch.full((2, 12, 1), 3.0), moving[..., 1:]], -1)
     plans = VectorPlans(values, [-1.0, -1e4, -1.0], [1.0, 1e4, 1.0])
-    prior = LINEAR[kind](plans.action_low, plans.action_high).fit(plans, generator=seeded(0))
+    make = {"synergies": lambda low, high: StepSynergies(low, high, 1)}.get(kind, LINEAR[kind])
+    prior = make(plans.action_low, plans.action_high).fit(plans, generator=seeded(0))
     drawn = prior.sample(100, 10, generator=seeded(1))[..., 1]
     assert float((drawn - 3).std()) == pytest.approx(10, rel=0.1)
 

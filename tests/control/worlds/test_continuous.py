@@ -82,10 +82,10 @@ def test_the_linear_quadratic_regulator_reaches_its_own_cost():
 
 
 def test_a_single_link_turns_as_a_rod():
-    """A rod of 1 kg and 1 m about its end has the inertia 1 / 3; masses are a factor of it."""
-    world = PlanarArm(1, masses=2.0, damping=0.0, num_substeps=1, obstacles=())
+    """A rod of 1 kg and 1 m about its end has the inertia 1 / 3; masses are a factor of it; damping is implicit."""
+    world = PlanarArm(1, masses=2.0, damping=0.3, num_substeps=1, obstacles=())
     state, _ = world.step(torch.tensor([[0.5, 0.25]]), torch.tensor([[0.4]]))
-    speed = 0.25 + 0.05 * 0.4 / (2 / 3)
+    speed = (0.25 + 0.05 * 0.4 / (2 / 3)) / (1 + 0.05 * 0.3 / (2 / 3))
     torch.testing.assert_close(state, torch.tensor([[0.5 + 0.05 * speed, speed]]))
 
 
