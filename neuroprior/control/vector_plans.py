@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_range, check_share, check_single_precision, check_sizes, is_integer
+from neuroprior._checks import check_range, check_single_precision, check_sizes, is_integer
 from neuroprior.plans.columns import check_distinct
 from neuroprior.plans.sequences import Sequences, check_index, counted
 
@@ -124,13 +124,6 @@ class VectorPlans(Sequences):
         ends = torch.arange(length, self.max_length + 1, device=self.actions.device)
         return every[ends <= self.mask().sum(1)[:, None]]
 
-    def at_bounds(self, share: float = 1e-3) -> Tensor:
-        """In each dimension the share of vectors at a bound, or within `share` of the range of one: float32 `[D]`."""
-        check_share("share", share)
-        slack = share * (self.action_high - self.action_low)
-        near = (self.actions <= self.action_low + slack) | (self.actions >= self.action_high - slack)
-        return near[self.mask()].float().mean(0)
-
 
 MIN_RELATIVE_WIDTH = 1e-4
 """The least width of a range, as a share of its bounds: float32 then has about a thousand numbers between them."""
@@ -153,11 +146,6 @@ def check_bounds(low: Tensor, high: Tensor) -> None:
             f"`action_low` must be below `action_high` by {MIN_WIDTH:g} to {MAX_WIDTH:g} and at least"
             f" {MIN_RELATIVE_WIDTH:g} of the bounds, got {float(low[d]):g} and {float(high[d]):g} in dimension {d}"
         )
-
-
-def same_bounds(bound: Tensor, other: Tensor, width: Tensor) -> bool:
-    """Whether two bounds `[D]` of ranges of `width [D]` are the same, but for a hundred-thousandth of the range."""
-    return bound.shape == other.shape and bool(((bound - other).abs() <= 1e-5 * width).all())
 
 
 def check_vectors(name: str, vectors: Tensor, low: Tensor, high: Tensor) -> None:

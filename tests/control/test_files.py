@@ -114,12 +114,6 @@ def test_what_is_wrong_with_trajectories_is_named(arguments, message):
         vector_plans_from_trajectories(*arguments)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
-def test_tensors_that_need_gradients_are_read(dtype):
-    actions = torch.full((3, 2), 0.5, requires_grad=True, dtype=dtype)
-    assert vector_plans_from_trajectories([{"actions": actions}], LOW, HIGH).actions.tolist() == [[[0.5, 0.5]] * 3]
-
-
 def test_readers_name_one_another(tmp_path):
     write_vector_plans(VectorPlans(torch.zeros(1, 2, 2), LOW, HIGH), tmp_path / "vectors.npz")
     with pytest.raises(ValueError, match="read_vector_plans"):
@@ -165,16 +159,3 @@ def test_damaged_files_are_refused_in_one_line_or_read(tmp_path, cut, byte):
     except ValueError as error:
         assert "plans.npz" in str(error)  # noqa: PT017
         assert "\n" not in str(error)  # noqa: PT017
-
-
-JUNK = st.one_of(st.none(), st.integers(), st.text(max_size=3), st.lists(st.floats(), max_size=3), st.floats())
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.lists(st.one_of(JUNK, st.dictionaries(st.sampled_from(["actions", "observations"]), JUNK)), max_size=3))
-def test_junk_is_refused_or_empty(trajectories):
-    try:
-        plans = vector_plans_from_trajectories(trajectories, LOW, HIGH)
-    except ValueError:
-        return
-    assert not plans.mask().any()

@@ -16,7 +16,6 @@ from neuroprior.control.vector_plans import (
     check_bounds,
     check_finite,
     check_vectors,
-    same_bounds,
 )
 from neuroprior.priors.saved import SavedModule
 
@@ -385,10 +384,13 @@ class VectorPrior(SavedModule):
         self.check_context(plans.context, len(plans))
 
     def check_same_bounds(self, other: Any, what: str) -> None:
-        """Raise ValueError unless the bounds of `other`, plans or a world, are those of this prior."""
+        """Raise ValueError unless the bounds of `other`, plans or a world, are those of this prior.
+
+        A hundred-thousandth of the range makes no difference.
+        """
         for name in ("action_low", "action_high"):
-            own, theirs = getattr(self, name).cpu(), getattr(other, name).cpu()
-            if not same_bounds(own, theirs, 2 * self.half_range.cpu()):
+            own, theirs = getattr(self, name), getattr(other, name).to(self.device)
+            if own.shape != theirs.shape or not bool(((own - theirs).abs() <= 2e-5 * self.half_range).all()):
                 raise ValueError(f"`{name}` of {what} must be that of the prior, {own.tolist()}, got {theirs.tolist()}")
 
     @property

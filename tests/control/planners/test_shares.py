@@ -128,19 +128,6 @@ def test_a_prior_that_is_as_good_keeps_most_of_its_share_and_a_better_one_nearly
     assert share_after(20, -2.0, num) < 0.15
 
 
-def test_a_prior_that_becomes_good_is_found_again():
-    """From the least share on: after fifty decisions in which its candidates alone are the best."""
-    generator, found = seeded(0), wins((0.0, 100.0), (20.0, 100.0)).expand(500, 2, 2)
-    number = []
-    for _ in range(50):
-        shares = Shares([20], 0.5, 500, generator, adapt=True, wins=found)
-        shares.observe(shares.is_prior(0).float() + 0.1 * torch.rand(500, 20, generator=generator))
-        found = shares.wins
-        number.append(float(shares.counts.double().mean()))
-    assert number[0] < 1.5
-    assert number[-1] > 9
-
-
 def test_each_start_gets_as_many_candidates_of_each_kind_as_it_should():
     shares = Shares([5], 0.6, 64, seeded(0), adapt=True, wins=wins((1.0, 300.0), (2.0, 300.0)).expand(64, 2, 2))
     (own, proposed), counts = shares.most[0], shares.counts[:, 0]

@@ -194,17 +194,6 @@ def test_a_stored_window_is_found_by_its_past():
     assert float(forecast.sample(seeded(0))) == pytest.approx(float(ramps[19]), abs=0.1)
 
 
-def test_priors_predict_held_out_plans_better_the_more_they_know():
-    plans, held_out = source(30, 60), source(10, 60, seed=9)
-    low, high = plans.action_low, plans.action_high
-    nats = {
-        name: float(KINDS[name](low, high).fit(plans, generator=seeded(0)).action_log_probs(held_out).mean())
-        for name in KINDS
-    }
-    assert nats["white"] < nats["coloured"] < nats["autoregressive"]
-    assert nats["white"] < nats["stored windows"] < nats["autoregressive"]
-
-
 def test_unequal_lengths_and_groups():
     """Beyond a plan's end nothing counts, in learning as in scoring."""
     plans = source(10, 30)

@@ -17,7 +17,7 @@ from tests.support.sources import refuses
 
 PLANNERS = {
     "shooting": ShootingPlanner,
-    "coloured": partial(ShootingPlanner, noise_beta=2.0, warm_start=False),
+    "coloured": partial(ShootingPlanner, noise_beta=2.0),
     "icem": ICEMPlanner,
     "all": partial(ICEMPlanner, prior_iterations=None, iterations=2),
     "mppi": MPPIPlanner,
