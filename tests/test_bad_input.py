@@ -158,8 +158,8 @@ PLANS = Plans(torch.tensor([[0, 1, 1], [1, 0, 1]]), 2)
         (lambda: report(PLANS, priors=[UniformPrior(2)]), ["priors", "a dict"]),
         (lambda: SamplingPlanner(UniformPrior(2), 2, 4).plan(ARM, torch.zeros(1, 4)), ["numbered", "not PlanarArm"]),
         (lambda: ExhaustivePlanner(2).plan(PlanarArm, torch.zeros(1, 4)), ["a World", "not the class PlanarArm"]),
-        (lambda: ICEMPlanner(2, 4).plan(cube(), torch.zeros(1, 4)), ["a ContinuousWorld", "vectors", "not PocketCube"]),
-        (lambda: control(ICEMPlanner(2, 4), None, torch.zeros(1, 4), 2), ["a ContinuousWorld", "not NoneType"]),
+        (lambda: ICEMPlanner(2, 4).plan(cube(), torch.zeros(1, 4)), ["a ContinuousWorld", "vectors", "got PocketCube"]),
+        (lambda: control(ICEMPlanner(2, 4), None, torch.zeros(1, 4), 2), ["a ContinuousWorld", "got NoneType"]),
         (lambda: report(PLANS, models=["counts"], folds=3), ["folds: at most 2", "not 3"]),
     ],
 )

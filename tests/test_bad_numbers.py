@@ -86,8 +86,6 @@ SHARES = {
         partial(VectorGRU, *ENDS),
     ],
     "uniform_share": [partial(SamplingPlanner, UNIFORM, 3, 4)],
-    "keep_elites": [partial(ICEMPlanner, 3, 20)],
-    "momentum": [partial(ICEMPlanner, 3, 20)],
     "prior_share": [partial(ShootingPlanner, 3, 4, prior=NoisePrior(*ENDS))],
     "share": [partial(CombinedPrior, 3), partial(MixturePrior, 3, [MarkovPrior(3)])],
     "sharing": [partial(SwitchingPrior, 3)],

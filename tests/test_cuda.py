@@ -29,7 +29,6 @@ from neuroprior import (
 )
 from neuroprior.control import (
     AutoregressivePrior,
-    DiscretisedPrior,
     DoubleIntegrator,
     ICEMPlanner,
     MPPIPlanner,
@@ -41,8 +40,6 @@ from neuroprior.control import (
     VectorGRU,
     VectorPlans,
     VectorPrior,
-    VectorTransformer,
-    WindowSynergies,
     control,
 )
 from neuroprior.planners import FrontierPlanner, oracle
@@ -139,7 +136,7 @@ def test_recorded_steps_draw_what_steps_draw(name: str, monkeypatch: pytest.Monk
 
 
 def test_recorded_steps_of_vectors(monkeypatch: pytest.MonkeyPatch) -> None:
-    prior = VectorGRU(LOW, HIGH, width=16, lags=2).fit(vectors(), generator=seeded(0), **QUICK).to(DEVICE)
+    prior = VectorGRU(LOW, HIGH, width=16).fit(vectors(), generator=seeded(0), **QUICK).to(DEVICE)
     past = vectors().actions[:, :5]
     drawn = []
     monkeypatch.setattr(recordings, "WORTH", 1)
@@ -270,12 +267,9 @@ VECTORS: dict[str, Callable[..., VectorPrior]] = {
     "noise": NoisePrior,
     "coloured": partial(NoisePrior, exponent=None, memory=4),
     "autoregressive": AutoregressivePrior,
-    "synergies": partial(WindowSynergies, window=6),
-    "step synergies": partial(StepSynergies, order=2),
+    "synergies": StepSynergies,
     "stored": partial(StoredWindows, match=2, horizon=4, max_windows=10),
     "gru": partial(VectorGRU, width=8),
-    "transformer": partial(VectorTransformer, width=16),
-    "discretised": lambda low, high: DiscretisedPrior(low, high, 5),
 }
 
 
@@ -283,7 +277,7 @@ VECTORS: dict[str, Callable[..., VectorPrior]] = {
 @pytest.mark.parametrize("first", ["cpu", "cuda"])
 def test_a_prior_over_vectors(name: str, first: str) -> None:
     """It conforms, whether it learned here or there, and predicts the same in both."""
-    settings = QUICK if name in ("gru", "transformer") else {}
+    settings = QUICK if name == "gru" else {}
     prior = VECTORS[name](LOW, HIGH).to(first).fit(vectors(), generator=seeded(0), **settings)
     assert prior.device.type == first
     here = prior.to("cpu").log_prob(vectors())

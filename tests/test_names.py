@@ -10,7 +10,6 @@ from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, SamplingPlanner, Uni
 from neuroprior.agents import Agent, Replay
 from neuroprior.behaviour import SemiMarkovPrior, two_sample_tests
 from neuroprior.control import (
-    DiscretisedPrior,
     DoubleIntegrator,
     NoisePrior,
     ShootingPlanner,
@@ -109,7 +108,6 @@ def moved(prior: VectorPrior) -> None:
 VECTOR_USES = {
     "scored": lambda plans: NoisePrior(*ENDS).fit(MOVES).log_prob(plans),
     "read back": lambda plans: again(NoisePrior(*ENDS).fit(MOVES)).log_prob(plans),
-    "tokens": lambda plans: DiscretisedPrior(*ENDS, num_bins=3).fit(MOVES).log_prob(plans),
     "learned further": lambda plans: VectorGRU(*ENDS, width=4).fit(MOVES, **SHORT).fit(plans, **SHORT),
     "validated": lambda plans: VectorGRU(*ENDS, width=4).fit(MOVES, validation=plans, **SHORT),
 }
@@ -142,7 +140,7 @@ def test_a_refused_fit_keeps_what_was_learned():
     stacked, noise = StackedPrior(4, 4).fit(PLANS, **SHORT), NoisePrior(*ENDS).fit(MOVES)
     with pytest.raises(ValueError, match=r"^action_names: "):
         stacked.fit(OTHERS, **SHORT)
-    with pytest.raises(ValueError, match=r"^action_high: "):
+    with pytest.raises(ValueError, match=r"^`action_high` of the plans "):
         noise.fit(replace(SWAPPED, action_high=torch.full((2,), 2.0)))
     assert stacked.action_names == tuple(NAMES)
     assert noise.action_names == HIP

@@ -14,7 +14,6 @@ from neuroprior.behaviour import DurationModel, SemiMarkovPrior
 from neuroprior.control import (
     DoubleIntegrator,
     VectorPlans,
-    VectorTransformer,
     read_vector_plans,
     vector_plans_from_trajectories,
     write_vector_plans,
@@ -36,12 +35,12 @@ def vectors(**fields: object) -> VectorPlans:
 REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "vectors of two dimensions": (lambda: vectors(actions=torch.zeros(2, 3)), "[N, L, D]"),
     "bounds the wrong way": (lambda: vectors(action_low=[1.0], action_high=[-1.0]), "action_low"),
-    "lengths of others": (lambda: vectors(lengths=torch.tensor([3])), "lengths: shape [2]"),
+    "lengths of others": (lambda: vectors(lengths=torch.tensor([3])), "`lengths` must be integers of shape [2]"),
     "groups of others": (lambda: vectors(group=torch.tensor([1])), "group"),
-    "a name for names": (lambda: vectors(action_names="torque"), "action_names: a list"),
+    "a name for names": (lambda: vectors(action_names="torque"), "`action_names` must be a list"),
     "context of others": (lambda: vectors(context=torch.zeros(5, 2)), "context"),
     "steps before the first": (lambda: vectors().steps(-1), "first: an integer of at least 0 is expected, not -1"),
-    "lengths that are words": (lambda: vectors(lengths=["long", "short"]), "lengths: integers"),
+    "lengths that are words": (lambda: vectors(lengths=["long", "short"]), "`lengths` must be numbers"),
     "plans that are none": (lambda: write_vector_plans(Plans(ZEROS, 1), "x.npz"), "VectorPlans"),
     "vectors in CSV": (lambda: write_vector_plans(vectors(), "x.csv"), ".npz"),
     "no name of a file": (lambda: read_vector_plans(3), "path"),
@@ -51,7 +50,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "integers observed": (
         lambda: vector_plans_from_trajectories([{"actions": VECTORS[0], "observations": [1, 2, 3]}], [-1.0], [1.0]),
-        "features are expected",
+        "must be arrays of features",
     ),
     "one plan by its number": (lambda: Plans(ZEROS, 1)[0], "plans[0 : 1]"),
     "one plan of vectors by its number": (lambda: vectors()[torch.tensor(0)], "plans[0 : 1]"),
@@ -70,7 +69,6 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         ),
         "sum to 1",
     ),
-    "an odd width": (lambda: VectorTransformer([-1.0], [1.0], width=5), "multiple of"),
     "a state that is no tensor": (lambda: DoubleIntegrator().rollout(3, VECTORS), "state"),
     "a state of other shape": (lambda: DoubleIntegrator().rollout(torch.zeros(2, 3), torch.zeros(2, 1, 3, 2)), "state"),
     "a table that is too large": (

@@ -8,11 +8,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pandas as pd
-import torch
 from jsonargparse.typing import PositiveInt
 
-from eval.control.animation import animate
-from eval.control.priors import NONE, check_prior_name, fitted
+from eval.control.priors import NONE, PriorName, ScoredName
 from eval.control.report import Results, control_document
 from eval.control.run import (
     Choice,
@@ -23,12 +21,11 @@ from eval.control.run import (
     Scoring,
     Tuning,
     collecting_run,
-    planner_of,
     planning_run,
     scoring_run,
     tuning_run,
 )
-from eval.control.tasks import CONDITIONS, TASKS, TaskName, check_there
+from eval.control.tasks import CONDITIONS, TaskName, check_there
 from eval.worlds import runs
 from neuroprior._jobs import JobRun
 from neuroprior.behaviour.report.document import publish, write_figures
@@ -40,7 +37,7 @@ FEW = ("half_cheetah", "arm")
 
 def control_experiment(
     tasks: Sequence[TaskName] = FEW,
-    priors: Sequence[str] = (NONE, "autoregressive", "synergies", "stored"),
+    priors: Sequence[PriorName] = (NONE, "autoregressive", "synergies", "stored"),
     planners: Sequence[PlannerName] = ("icem",),
     budgets: Sequence[PositiveInt] = (8, 16, 32),
     plain_budgets: Sequence[PositiveInt] = (100,),
@@ -54,9 +51,8 @@ def control_experiment(
     processes: PositiveInt | None = None,
     dask: str | None = None,
     out: str = "runs/control",
-    scored: Sequence[str] = (),
+    scored: Sequence[ScoredName] = (),
     conditions: Sequence[Literal["same", "masses", "goal"]] = CONDITIONS,  # type: ignore[assignment]
-    animation: TaskName | None = None,
 ) -> None:
     """Do learned priors help planners of continuous actions?
 
@@ -69,8 +65,7 @@ def control_experiment(
 
     Args:
         tasks: simulators; all but the arm and the double integrator need the extra mujoco.
-        priors: that propose candidates; "none" is the plain planner, to which the others are compared. synergies-4: of
-            four components.
+        priors: that propose candidates; "none" is the plain planner, to which the others are compared.
         planners: that are given the proposals.
         budgets: candidates that a decision simulates.
         plain_budgets: further ones, for the plain planner alone.
@@ -86,19 +81,14 @@ def control_experiment(
         out: folder for the report and for finished runs.
         scored: further priors that are only fitted and scored on held-out plans.
         conditions: worlds in which planners are tried.
-        animation: draw a run in this task, with stored windows and the most candidates, as TASK.gif in the folder.
     """
     runs.check_distinct(tasks=tasks, priors=priors, planners=planners, budgets=budgets, plain_budgets=plain_budgets)
     if scored:
         runs.check_distinct(scored=scored)
     runs.check_distinct(conditions=conditions)
-    for name in (*priors, *scored):
-        check_prior_name(name)
-    if NONE in scored:
-        raise ValueError('scored: "none" is no prior')
     if NONE not in priors:
-        raise ValueError('priors: "none", the plain planner, is needed to compare with')
-    for task in (*tasks, *([] if animation is None else [animation])):
+        raise ValueError(f'`priors` must have "none", the plain planner, to compare with, got {list(priors)}')
+    for task in tasks:
         check_there(task)
     numbers = tuple(sorted(budgets))
     settings = ControlSettings(
@@ -140,7 +130,6 @@ def control_experiment(
     )
     entries: list[Any] = []
     likelihoods: list[Any] = []
-    cloned: list[Any] = []
     how_kept = {"save": lambda path, plans: write_vector_plans(plans, path), "load": read_vector_plans}
 
     def collected(number: int, held_out: bool) -> dict[str, VectorPlans]:
@@ -159,9 +148,8 @@ def control_experiment(
             for planner in planners
             for prior in priors
         ]
-        for found in done("planning", planning_run, planning):
-            entries += found["entries"]
-            cloned += [found["alone"]] if found["alone"] is not None else []
+        for rows in done("planning", planning_run, planning):
+            entries += rows
     for number in range(seeds if learned or scored else 0):
         plans, held_out = collected(number, False), collected(number, True)
         scoring = [
@@ -172,24 +160,8 @@ def control_experiment(
         likelihoods += done("scoring", scoring_run, scoring)
     shown = {"tasks": list(tasks), "priors": list(priors), "planners": list(planners), "scored": list(scored)}
     shown |= {"conditions": list(conditions), "seeds": seeds} | asdict(settings)
-    results = Results(pd.DataFrame(entries), pd.DataFrame(likelihoods), pd.DataFrame(cloned))
+    results = Results(pd.DataFrame(entries), pd.DataFrame(likelihoods))
     settled = {"/".join(place): choice._asdict() for place, choice in choices.items()}
     document = control_document(results, shown | {"choices": settled}, runs.command_line("control"))
     publish(document, Path(out))
     write_figures(Path(out), document.figures)
-    if animation is not None:
-        _animated(animation, settings, alone.get((animation, "icem", NONE), Choice(0.6, 1.0)), Path(out))
-
-
-def _animated(task: str, settings: ControlSettings, choice: Choice, out: Path) -> None:
-    """A moving picture of iCEM in the world before it changed; a line that says why, where there can be none."""
-    path, horizon = out / f"{task}.gif", TASKS[task].horizon
-    try:
-        plans = collecting_run(Collecting(task, 0, choice), settings)
-        prior = fitted("stored", plans, horizon, torch.Generator())
-        choice = choice._replace(share=0.5, iterations=1)
-        planner = planner_of("icem", horizon, max(settings.budgets), choice, prior)
-        animate(task, "same", planner, settings.steps, path, torch.Generator().manual_seed(settings.seed))
-        print(f"animation: {path}")
-    except ValueError as error:
-        print(f"no animation: {error}")

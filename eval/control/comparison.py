@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from eval.control.priors import CLONING, NETWORKS, NONE, SIMPLE, parted
+from eval.control.priors import CLONING, NETWORK, NONE, SIMPLE
 from eval.worlds import runs
-from neuroprior.behaviour.analysis.statistics import ENOUGH_UNITS, paired_difference
+from neuroprior.behaviour.analysis.statistics import ENOUGH_UNITS
 
 REFERENCE = 100
 """Candidates of the plain planner whose return is to be reached with fewer, or the nearest number that is tried."""
@@ -17,7 +17,7 @@ RESAMPLES = 1000
 """Of seeds, for the intervals of `savings`."""
 
 
-def paired(pairs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
+def pair_by_seed(pairs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     """`runs.paired_differences`; no p-values, and so no verdict, from fewer than `ENOUGH_UNITS` seeds."""
     found = runs.paired_differences(pairs, by)
     if pairs["seed"].nunique() < ENOUGH_UNITS:
@@ -30,7 +30,7 @@ def differences(frame: pd.DataFrame) -> pd.DataFrame:
     place = ["world", "condition", "planner", "budget"]
     plain = frame.loc[frame["prior"] == NONE, [*place, "seed", "return"]].rename(columns={"return": "second"})
     pairs = frame[frame["prior"] != NONE].rename(columns={"return": "first"}).merge(plain, on=[*place, "seed"])
-    return paired(pairs, [*place, "prior"])
+    return pair_by_seed(pairs, [*place, "prior"])
 
 
 def savings(frame: pd.DataFrame) -> pd.DataFrame:
@@ -57,28 +57,28 @@ def savings(frame: pd.DataFrame) -> pd.DataFrame:
         plain_budgets, plain = plain_curve.columns.to_numpy(float), plain_curve.to_numpy()
         reference, seeds = float(np.clip(REFERENCE, plain_budgets[0], plain_budgets[-1])), len(plain)
         draws = np.random.default_rng(0).integers(seeds, size=(RESAMPLES, seeds))
-        seconds = interpolated(reference, plain_budgets, plain_seconds.to_numpy().mean(0))
+        seconds = interpolate(reference, plain_budgets, plain_seconds.to_numpy().mean(0))
         for prior, (returns, times) in curves.items():
             budgets, curve = returns.columns.to_numpy(float), returns.to_numpy()
-            needed = candidates_needed(budgets, curve.mean(0), interpolated(reference, plain_budgets, plain.mean(0)))
+            needed = candidates_needed(budgets, curve.mean(0), interpolate(reference, plain_budgets, plain.mean(0)))
             low = high = float("nan")
             if seeds >= 5:
                 sampled = [
                     candidates_needed(
-                        budgets, curve[draw].mean(0), interpolated(reference, plain_budgets, plain[draw].mean(0))
+                        budgets, curve[draw].mean(0), interpolate(reference, plain_budgets, plain[draw].mean(0))
                     )
                     for draw in draws
                 ]
                 low, high = np.quantile(sampled, [0.025, 0.975], method="inverted_cdf")
             faster = float("nan")
             if np.isfinite(needed):
-                faster = seconds / interpolated(needed, budgets, times.to_numpy().mean(0))
+                faster = seconds / interpolate(needed, budgets, times.to_numpy().mean(0))
             rows.append((*place, prior, reference, needed, low, high, faster, seeds))
     names = ["task", "condition", "planner", "prior", "reference", "needed", "low", "high", "faster", "seeds"]
     return pd.DataFrame(rows, columns=names)
 
 
-def interpolated(budget: float, budgets: NDArray[np.float64], values: NDArray[np.float64]) -> float:
+def interpolate(budget: float, budgets: NDArray[np.float64], values: NDArray[np.float64]) -> float:
     """A value between those of the neighbouring budgets, linear in the logarithm of the budget."""
     return float(np.interp(np.log(budget), np.log(budgets), values))
 
@@ -97,35 +97,8 @@ def candidates_needed(budgets: NDArray[np.float64], returns: NDArray[np.float64]
     return float("inf")
 
 
-def matches(frame: pd.DataFrame) -> pd.DataFrame:
-    """The fewest candidates that match the plain planner with `REFERENCE`, or the nearest number that was tried.
-
-    Returns:
-        A row for each task, condition, planner and prior, the plain planner with fewer candidates among them:
-        `reference`; `equal`, the smallest budget with at least the mean return of the reference; `close`, the smallest
-        whose return is not significantly below it (the 95 % interval of the difference, paired by seed, reaches 0).
-        Infinite where no budget that was tried does; missing with fewer than `ENOUGH_UNITS` seeds.
-    """
-    rows = []
-    for place, own in frame.groupby(["task", "condition", "planner"], sort=False):
-        returns = own.pivot_table("return", "seed", ["prior", "budget"])
-        if NONE not in returns:
-            continue
-        reference = min(returns[NONE].columns, key=lambda budget: (abs(budget - REFERENCE), budget))
-        for prior in own["prior"].unique():
-            equal = close = float("nan") if len(returns) < ENOUGH_UNITS else float("inf")
-            for budget in sorted(returns[prior].columns) if len(returns) >= ENOUGH_UNITS else ():
-                if prior != NONE or budget < reference:
-                    gap = paired_difference(returns[prior][budget], returns[NONE][reference])
-                    equal = min(equal, budget if gap.mean >= 0 else equal)
-                    close = min(close, budget if gap.high >= 0 else close)
-            rows.append((*place, prior, reference, equal, close, len(returns)))
-    names = ["task", "condition", "planner", "prior", "reference", "equal", "close", "seeds"]
-    return pd.DataFrame(rows, columns=names)
-
-
 def against_simple(values: pd.DataFrame, by: Sequence[str], value: str) -> pd.DataFrame:
-    """Networks minus the best prior that is none, in the mean over seeds; see `paired`.
+    """Networks minus the best prior that is none, in the mean over seeds; see `pair_by_seed`.
 
     Args:
         values: a row a seed of each group and prior, with the columns `by`, `prior`, `seed` and `value`.
@@ -133,18 +106,17 @@ def against_simple(values: pd.DataFrame, by: Sequence[str], value: str) -> pd.Da
         value: the column that is compared.
 
     Returns:
-        As `paired`, by `by`, `prior`, the network, and `baseline`, what it is compared with.
+        As `pair_by_seed`, by `by`, `prior`, the network, and `baseline`, what it is compared with.
     """
     parts = []
     for _, own in values.groupby(list(by), sort=False):
-        kind = own["prior"].map(lambda name: parted(name)[0])
-        simple, networks = own[kind.isin(SIMPLE)], own[kind.isin([*NETWORKS, CLONING])]
+        simple, networks = own[own["prior"].isin(SIMPLE)], own[own["prior"].isin([NETWORK, CLONING])]
         if len(simple):
             best = str(simple.groupby("prior", sort=False)[value].mean().idxmax())
             second = networks["seed"].map(simple[simple["prior"] == best].set_index("seed")[value])
             parts.append(networks.assign(first=networks[value], second=second, baseline=best))
     pairs = pd.concat(parts) if parts else values.assign(first=0.0, second=0.0, baseline="")[:0]
-    return paired(pairs, [*by, "prior", "baseline"])
+    return pair_by_seed(pairs, [*by, "prior", "baseline"])
 
 
 def over_budgets(frame: pd.DataFrame) -> pd.DataFrame:
@@ -154,22 +126,3 @@ def over_budgets(frame: pd.DataFrame) -> pd.DataFrame:
     means = frame[frame["budget"].isin(common)].groupby(place, sort=False)["return"].mean()
     found: pd.DataFrame = means.reset_index()
     return found
-
-
-def synergies(frame: pd.DataFrame) -> pd.DataFrame:
-    """Returns with synergies of windows minus those with synergies per step, at equal numbers of components.
-
-    Returns:
-        As `paired`, of the mean return over budgets, by task (`world`), `condition`, `planner` and `components`, their
-        number or "chosen" where held-out plans chose it.
-    """
-    means = over_budgets(frame)
-    names = [parted(name) for name in means["prior"]]
-    numbers = ["chosen" if number is None else str(number) for _, number in names]
-    means = means.assign(kind=[kind for kind, _ in names], components=numbers)
-    place = ["world", "condition", "planner", "components"]
-    windows, steps = (means[means["kind"] == kind] for kind in ("synergies", "step-synergies"))
-    pairs = windows.rename(columns={"return": "first"}).merge(
-        steps.rename(columns={"return": "second"})[[*place, "seed", "second"]], on=[*place, "seed"]
-    )
-    return paired(pairs, place)

@@ -1,15 +1,13 @@
 """What `python -m eval control` does in its runs: tune on validation seeds, collect plans, score priors, and plan."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from time import process_time
 from typing import Any, Literal, NamedTuple
 
 import torch
-from torch import Tensor
 
-from eval.control.priors import CLONING, NONE, fitted
+from eval.control.priors import CLONING, NONE, fit_prior
 from eval.control.tasks import TASKS, Condition
 from neuroprior.control import (
     ContinuousWorld,
@@ -85,7 +83,7 @@ class Choice(NamedTuple):
     proposes: str = "plans"
 
 
-def planner_of(name: str, horizon: int, budget: int, choice: Choice, prior: VectorPrior | None) -> VectorPlanner:
+def make_planner(name: str, horizon: int, budget: int, choice: Choice, prior: VectorPrior | None) -> VectorPlanner:
     """A planner by name, with what was chosen for it."""
     how: dict[str, Any] = {"std": choice.std, "noise_beta": choice.exponent, "prior": prior}
     how |= {"prior_share": choice.share if prior is not None else 0.0, "prior_as": choice.proposes}
@@ -176,7 +174,7 @@ def generator_of(settings: ControlSettings, seed: int, *place: object) -> torch.
     return torch.Generator().manual_seed(number)
 
 
-def controlled(
+def control_starts(
     planner: VectorPlanner, world: ContinuousWorld, settings: ControlSettings, seed: int, starts: int, *place: object
 ) -> Control:
     """A run from each of the seed's starts."""
@@ -193,7 +191,7 @@ def collecting_run(run: Collecting, settings: ControlSettings) -> VectorPlans:
     what = "held out" if run.held_out else "training"
     starts = max(number // 2, 1) if run.held_out else number
     state = world.reset(starts, generator_of(settings, run.seed, what, "starts"))
-    planner = planner_of("icem", task.horizon, settings.training_budget, run.choice, None)
+    planner = make_planner("icem", task.horizon, settings.training_budget, run.choice, None)
     return control(planner, world, state, settings.steps, generator_of(settings, run.seed, what)).plans
 
 
@@ -209,7 +207,7 @@ def tuning_run(run: Tuning, settings: ControlSettings) -> Choice:
         assert run.choices is not None
         for seed in seeds:
             plans = collecting_run(Collecting(run.world, seed, run.choices[0]), settings)
-            priors[seed] = fitted(run.prior, plans, task.horizon, generator_of(settings, seed, run.prior))
+            priors[seed] = fit_prior(run.prior, plans, task.horizon, generator_of(settings, seed, run.prior))
 
     def best(choices: Sequence[Choice]) -> Choice:
         returns = torch.tensor(
@@ -217,8 +215,8 @@ def tuning_run(run: Tuning, settings: ControlSettings) -> Choice:
                 [
                     sum(
                         _return_of(
-                            controlled(
-                                planner_of(run.planner, task.horizon, settings.tuning_budget, choice, priors[seed]),
+                            control_starts(
+                                make_planner(run.planner, task.horizon, settings.tuning_budget, choice, priors[seed]),
                                 worlds[name],
                                 settings,
                                 seed,
@@ -246,82 +244,46 @@ def scoring_run(run: Scoring, settings: ControlSettings) -> dict[str, Any]:
     """Fit a prior, and score held-out plans.
 
     Returns:
-        `nats`, the log-density of a vector of held-out plans; `fit_seconds`; `for_80`, `for_95`: how many components
-        explain so many per cent of the variance, None where there are none.
+        `nats`, the log-density of a vector of held-out plans; `fit_seconds`.
     """
     task = TASKS[run.world]
     began = process_time()
-    prior = fitted(run.prior, run.plans, task.horizon, generator_of(settings, run.seed, run.prior))
+    prior = fit_prior(run.prior, run.plans, task.horizon, generator_of(settings, run.seed, run.prior))
     seconds = process_time() - began
     held_out = run.held_out if run.prior == CLONING else run.held_out.without_context()
     with torch.no_grad():
         nats = float(prior.log_prob(held_out).sum() / held_out.mask().sum())
-    explained = getattr(prior, "explained", ())
-    found = {"world": run.world, "seed": run.seed, "prior": run.prior, "nats": nats, "fit_seconds": seconds}
-    return found | {f"for_{share}": _components(explained, share / 100) for share in (80, 95)}
+    return {"world": run.world, "seed": run.seed, "prior": run.prior, "nats": nats, "fit_seconds": seconds}
 
 
-def planning_run(run: Planning, settings: ControlSettings) -> dict[str, Any]:
+def planning_run(run: Planning, settings: ControlSettings) -> list[dict[str, Any]]:
     """Fit a prior, and control the world with it, once with each budget.
 
     Returns:
-        `entries`, one of each budget: `return`, the sum of rewards; `seconds`, processor time of a decision, which
-        other programs on the machine change less than wall-clock; and `sampling`, those of them in which the prior is
-        drawn from. `alone`: of behaviour cloning the return without a planner, else None.
+        A row for each budget: `return`, the sum of rewards; `seconds`, processor time of a decision, which other
+        programs on the machine change less than wall-clock.
     """
     task = TASKS[run.world]
     world, place = task.make(run.condition), {"world": run.world, "seed": run.seed, "condition": run.condition}
     prior = None
     if run.prior != NONE:
         assert run.plans is not None
-        prior = fitted(run.prior, run.plans, task.horizon, generator_of(settings, run.seed, run.prior))
+        prior = fit_prior(run.prior, run.plans, task.horizon, generator_of(settings, run.seed, run.prior))
     # Without a share of candidates it is the plain planner, and draws the same numbers: they do not differ by chance.
     drawn_as = run.prior if run.choice.share else NONE
     entries = []
     for budget in (*settings.budgets, *(settings.plain_budgets if prior is None else ())):
-        planner = planner_of(run.planner, task.horizon, budget, run.choice, prior)
+        planner = make_planner(run.planner, task.horizon, budget, run.choice, prior)
         began = process_time()
-        with drawing(prior) as drawn:
-            done = controlled(planner, world, settings, run.seed, 1, run.planner, drawn_as, budget)
+        done = control_starts(planner, world, settings, run.seed, 1, run.planner, drawn_as, budget)
         seconds, decisions = process_time() - began, max(int(done.plans.mask().sum()), 1)
         entries.append(
             place
             | {"planner": run.planner, "prior": run.prior, "budget": budget, "return": _return_of(done)}
-            | {"seconds": seconds / decisions, "sampling": drawn[0] / decisions}
+            | {"seconds": seconds / decisions}
         )
-    alone = None
-    if run.prior == CLONING:
-        first = ShootingPlanner(1, 1, prior=prior, prior_share=1.0, warm_start=False)
-        alone = _return_of(controlled(first, world, settings, run.seed, 1, "alone"))
-    return {"entries": entries, "alone": place | {"prior": CLONING, "return": alone} if alone is not None else None}
-
-
-@contextmanager
-def drawing(prior: VectorPrior | None) -> Iterator[list[float]]:
-    """While this is open, the list's only number is the processor time, in s, in which the prior drew plans."""
-    spent = [0.0]
-    if prior is None:
-        yield spent
-        return
-    sample = prior.sample
-
-    def timed(*args: Any, **how: Any) -> Tensor:
-        began = process_time()
-        plans = sample(*args, **how)
-        spent[0] += process_time() - began
-        return plans
-
-    prior.sample = timed  # type: ignore[method-assign]
-    try:
-        yield spent
-    finally:
-        del prior.sample
+    return entries
 
 
 def _return_of(done: Control) -> float:
     return float(done.rewards.sum(1).mean())
-
-
-def _components(explained: Sequence[float], share: float) -> int | None:
-    """How many components explain at least this share; None where there are none."""
-    return next((n for n, so_far in enumerate(explained, 1) if so_far >= share), None) if explained else None

@@ -9,17 +9,16 @@ from neuroprior.control.planners.shares import Shares
 from neuroprior.control.planners.shooting import ShootingPlanner
 from neuroprior.control.planners.vector_planner import Memory, VectorDecision, VectorPlanner
 from neuroprior.control.priors.autoregressive import AutoregressivePrior
-from neuroprior.control.priors.discretised import DiscretisedPrior
-from neuroprior.control.priors.networks import VectorGRU, VectorTransformer
+from neuroprior.control.priors.networks import VectorGRU
 from neuroprior.control.priors.noise import NoisePrior
 from neuroprior.control.priors.stored_windows import StoredWindows
-from neuroprior.control.priors.synergies import StepSynergies, WindowSynergies
-from neuroprior.control.priors.vector_prior import Forecast, GaussianForecast, VectorPrior
+from neuroprior.control.priors.synergies import StepSynergies
+from neuroprior.control.priors.vector_prior import GaussianForecast, VectorPrior
 from neuroprior.control.testing.planners import check_vector_planner
 from neuroprior.control.testing.priors import check_vector_prior
 from neuroprior.control.testing.worlds import check_continuous_world
 from neuroprior.control.vector_plans import VectorPlans
-from neuroprior.control.worlds.continuous_world import ContinuousWorld, check_vectors
+from neuroprior.control.worlds.continuous_world import ContinuousWorld
 from neuroprior.control.worlds.double_integrator import DoubleIntegrator
 from neuroprior.control.worlds.mujoco import MujocoWorld
 from neuroprior.control.worlds.mujoco_tasks import from_mujoco
@@ -33,9 +32,7 @@ __all__ = [
     "AutoregressivePrior",
     "ContinuousWorld",
     "Control",
-    "DiscretisedPrior",
     "DoubleIntegrator",
-    "Forecast",
     "GaussianForecast",
     "ICEMPlanner",
     "MPPIPlanner",
@@ -52,9 +49,6 @@ __all__ = [
     "VectorPlanner",
     "VectorPlans",
     "VectorPrior",
-    "VectorTransformer",
-    "WindowSynergies",
-    "check_vectors",
     "check_continuous_world",
     "check_vector_planner",
     "check_vector_prior",

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuroprior._checks import kind_of
 from neuroprior._files import written_whole
 from neuroprior.control.vector_plans import VectorPlans
 from neuroprior.plans.columns import listed, padded
@@ -50,16 +51,16 @@ def read_vector_plans(path: str | os.PathLike[str]) -> VectorPlans:
     arrays, unused = arrays_of(place, (*NUMBERS, "action_names"))
     for key in ("actions", "action_low", "action_high"):
         if key not in arrays:
-            raise ValueError(f"{place}: no array {key!r}; it has {', '.join(sorted([*arrays, *unused])) or 'none'}")
+            raise ValueError(f"{place}: `{key}` is missing, got {', '.join(sorted([*arrays, *unused])) or 'no arrays'}")
     for key, array in arrays.items():
         if key in NUMBERS and array.dtype.kind not in "iuf":
-            raise ValueError(f"{place}: {key}: an array of numbers is expected, not of {array.dtype}")
+            raise ValueError(f"{place}: `{key}` must be numbers, got {array.dtype}")
     names = names_of(place, "action_names", arrays["action_names"]) if "action_names" in arrays else None
     numbers: dict[str, Any] = {key: torch.from_numpy(native(arrays[key])) for key in NUMBERS if key in arrays}
     if numbers["actions"].dim() == 2:
         raise ValueError(
-            f"{place}: actions are of shape {list(numbers['actions'].shape)}; vectors [N, L, D] are expected (cut"
-            " a flat recording into episodes for vector_plans_from_trajectories; read_plans reads discrete actions)"
+            f"{place}: `actions` must have shape [N, L, D], got {list(numbers['actions'].shape)} (cut a flat recording"
+            " into episodes for vector_plans_from_trajectories; read_plans reads discrete actions)"
         )
     if unused:
         warnings.warn(f"{place}: arrays that are not used: {listed(unused)}", stacklevel=2)
@@ -84,7 +85,7 @@ def write_vector_plans(plans: VectorPlans, path: str | os.PathLike[str]) -> None
         >>> write_vector_plans(VectorPlans(torch.zeros(4, 10, 2), [-1.0, -1.0], [1.0, 1.0]), "reaching.npz")
     """
     if not isinstance(plans, VectorPlans):
-        raise ValueError(f"plans: VectorPlans are expected, not {type(plans).__name__}")
+        raise ValueError(f"`plans` must be VectorPlans, got {kind_of(plans)}")
     place = _npz(path)
     arrays = {key: as_array(getattr(plans, key)) for key in NUMBERS if getattr(plans, key) is not None}
     if plans.action_names is not None:
@@ -117,12 +118,11 @@ def vector_plans_from_trajectories(
         torch.Size([1, 3, 2])
     """
     if observations not in ("context", None):
-        raise ValueError(f"observations: 'context' or None is expected, not {observations!r}")
+        raise ValueError(f"`observations` must be 'context' or None, got {observations!r}")
     low, high = (array_of(bound, name) for bound, name in ((action_low, "action_low"), (action_high, "action_high")))
     if low.ndim != 1 or low.shape != high.shape:
         raise ValueError(
-            f"action_low, action_high: [D] numbers each, one a dimension, are expected, not of shape {list(low.shape)}"
-            f" and {list(high.shape)}"
+            f"`action_low` and `action_high` must have shape [D], got {list(low.shape)} and {list(high.shape)}"
         )
     check_are_several(trajectories)
     taken, observed = [], []
@@ -134,17 +134,17 @@ def vector_plans_from_trajectories(
             vectors = np.zeros((0, low.size), np.float32)
         if vectors.dtype.kind not in "iuf" or vectors.ndim != 2 or vectors.shape[1] != low.size:
             raise ValueError(
-                f"{place}: actions are {vectors.dtype} of shape {list(vectors.shape)}; [T, {low.size}] numbers are"
-                " expected (of discrete actions see from_trajectories)"
+                f"{place}: `actions` must be numbers [T, {low.size}], got {vectors.dtype} {list(vectors.shape)} (of"
+                " discrete actions see from_trajectories)"
             )
         taken.append(vectors.astype(np.float32))
         if observations is not None:
             features = None if made is None else observations_of(made, len(vectors), place)
             if features is not None and features.ndim == 1:
-                raise ValueError(f"{place}: observations are integers; arrays of features are expected")
+                raise ValueError(f"{place}: `observations` must be arrays of features, got integers")
             observed.append(features)
     if not taken:
-        raise ValueError("trajectories: at least one is expected; the list is empty")
+        raise ValueError("`trajectories` must have at least one, got an empty list")
     lengths = np.array([len(vectors) for vectors in taken])
     context = joined(observed)
     try:
@@ -164,10 +164,10 @@ def _read_minari(dataset_id: str) -> VectorPlans:
     with one_line(dataset_id):
         space = dataset.action_space
         if not hasattr(space, "low") or len(space.shape) != 1:
-            raise ValueError(f"actions of the space {space}; a Box of one dimension is expected (else see read_minari)")
+            raise ValueError(f"actions must be of a Box of one dimension, got {space} (else see read_minari)")
         if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
             raise ValueError(
-                f"actions of the space {space}: finite bounds are expected; where you know them, give them to"
+                f"actions must have finite bounds, got {space}; where you know them, give them to"
                 f" vector_plans_from_trajectories(minari.load_dataset({dataset_id!r}).iterate_episodes(), low, high)"
             )
         return vector_plans_from_trajectories(dataset.iterate_episodes(), space.low, space.high)
@@ -175,7 +175,7 @@ def _read_minari(dataset_id: str) -> VectorPlans:
 
 def _npz(path: str | os.PathLike[str]) -> Path:
     if not isinstance(path, str | os.PathLike):
-        raise ValueError(f"path: the name of a file is expected, not {type(path).__name__}")
+        raise ValueError(f"`path` must be the name of a file, got {kind_of(path)}")
     if Path(path).suffix.lower() != ".npz":
-        raise ValueError(f"{path}: plans of vectors are in files of the kind .npz, or minari: and a dataset's name")
+        raise ValueError(f"`path` must end in .npz, or be minari: and a dataset's name, got {path}")
     return Path(path)

@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_range, check_share, check_single_precision, check_sizes, is_integer
+from neuroprior._checks import check_range, check_single_precision, check_sizes, is_integer
 from neuroprior.plans.columns import check_distinct
 from neuroprior.plans.sequences import Sequences, check_index, counted
 
@@ -46,73 +45,47 @@ class VectorPlans(Sequences):
 
     def __post_init__(self) -> None:
         actions = as_floats("actions", self.actions)
-        if actions.dim() != 3 or not actions.shape[2]:
-            raise ValueError(f"actions: shape [N, L, D] is expected, D of 1 or more, not {list(actions.shape)}")
-        object.__setattr__(self, "actions", actions)
+        if actions.dim() != 3:
+            raise ValueError(f"`actions` must have shape [N, L, D], got {list(actions.shape)}")
         num, length, size = actions.shape
         for name in ("action_low", "action_high"):
             bound = as_floats(name, getattr(self, name)).to(actions.device)
-            if bound.shape != (size,) or not bound.isfinite().all():
-                raise ValueError(f"{name}: {size} finite numbers are expected, one a dimension, not {bound.tolist()}")
+            if bound.shape != (size,):
+                raise ValueError(f"`{name}` must have shape [{size}], as the vectors, got {list(bound.shape)}")
             object.__setattr__(self, name, bound)
-        if not bool((self.action_low < self.action_high).all()):
-            d = int((self.action_low >= self.action_high).nonzero()[0, 0])
-            raise ValueError(
-                f"action_low[{d}]: {float(self.action_low[d]):g} is not below action_high[{d}],"
-                f" {float(self.action_high[d]):g}"
-            )
-        check_widths(self.action_low, self.action_high)
+        check_bounds(self.action_low, self.action_high)
+        # From here on `self.mask()` can be asked.
+        object.__setattr__(self, "actions", actions)
         if self.lengths is not None:
-            lengths = _integers("lengths", self.lengths)
-            if lengths.shape != (num,):
-                raise ValueError(f"lengths: shape [{num}] is expected, not {list(lengths.shape)}")
+            lengths = _integers("lengths", self.lengths, num)
             check_range("lengths", lengths, length + 1, "possible lengths")
             object.__setattr__(self, "lengths", lengths.long())
-            actions = actions.masked_fill(~self.mask()[..., None], 0)
-        slack = 1e-6 * (self.action_high - self.action_low)
-        inside = (actions >= self.action_low - slack) & (actions <= self.action_high + slack)
-        wrong = ~inside & self.mask()[..., None]
-        if wrong.any():
-            where = wrong.nonzero()[0].tolist()
-            low, high = float(self.action_low[where[2]]), float(self.action_high[where[2]])
-            raise ValueError(
-                f"actions{where}: {float(actions[tuple(where)]):g} is not between the bounds of dimension {where[2]},"
-                f" {low:g} and {high:g}"
-            )
-        kept = actions.clamp(self.action_low, self.action_high)
-        object.__setattr__(self, "actions", kept.masked_fill(~self.mask()[..., None], 0))
+        counts = self.mask()[..., None]
+        check_vectors("actions", torch.where(counts, actions, self.action_low), self.action_low, self.action_high)
+        inside = actions.clamp(self.action_low, self.action_high)
+        object.__setattr__(self, "actions", inside.masked_fill(~counts, 0))
         if self.group is not None:
-            group = _integers("group", self.group)
-            if not is_integer(group) or group.shape != (num,):
-                raise ValueError(
-                    f"group: integers of shape [{num}] are expected, not {group.dtype} {list(group.shape)}"
-                )
-            object.__setattr__(self, "group", group)
+            object.__setattr__(self, "group", _integers("group", self.group, num))
         if self.context is not None:
-            self._check_context(num, length)
+            object.__setattr__(self, "context", self._check_context(num, length))
         if self.action_names is not None:
-            if not isinstance(self.action_names, Sequence | np.ndarray) or isinstance(self.action_names, str):
-                raise ValueError(f"action_names: a list is expected, not {type(self.action_names).__name__}")
-            if len(self.action_names) != size:
-                raise ValueError(f"action_names: {size} are expected, one a dimension, not {self.action_names!r}")
+            if isinstance(self.action_names, str) or len(self.action_names) != size:
+                raise ValueError(
+                    f"`action_names` must be a list of {size} names, one a dimension, got {self.action_names!r}"
+                )
             check_distinct("action_names", self.action_names)
 
-    def _check_context(self, num: int, length: int) -> None:
+    def _check_context(self, num: int, length: int) -> Tensor:
+        """The context as it is stored."""
         context = as_floats("context", self.context)
         shape = tuple(context.shape)
         if shape[:-1] not in ((num,), (num, length)):
-            raise ValueError(
-                f"context: features of shape [{num}, C] or [{num}, {length}, C] are expected, not {list(shape)}"
-            )
+            raise ValueError(f"`context` must have shape [{num}, C] or [{num}, {length}, C], got {list(shape)}")
         if len(shape) == 3:
             context = context.masked_fill(~self.mask()[..., None], 0)
-        if not context.isfinite().all():
-            where = (~context.isfinite()).nonzero()[0].tolist()
-            raise ValueError(f"context{where}: {float(context[tuple(where)])} is not a finite number")
-        given = torch.as_tensor(self.context)
-        if given.dtype == torch.float64:
-            check_single_precision("context", counted(given, self.mask()))
-        object.__setattr__(self, "context", context)
+        check_finite("context", context)
+        check_single_precision("context", counted(torch.as_tensor(self.context), self.mask()))
+        return context
 
     @property
     def action_size(self) -> int:
@@ -151,52 +124,75 @@ class VectorPlans(Sequences):
         ends = torch.arange(length, self.max_length + 1, device=self.actions.device)
         return every[ends <= self.mask().sum(1)[:, None]]
 
-    def at_bounds(self, share: float = 1e-3) -> Tensor:
-        """In each dimension the share of vectors at a bound, or within `share` of the range of one: float32 `[D]`."""
-        check_share("share", share)
-        slack = share * (self.action_high - self.action_low)
-        near = (self.actions <= self.action_low + slack) | (self.actions >= self.action_high - slack)
-        return near[self.mask()].float().mean(0)
 
-
-COARSEST = 1e-4
+MIN_RELATIVE_WIDTH = 1e-4
 """The least width of a range, as a share of its bounds: float32 then has about a thousand numbers between them."""
 
-WIDTHS = 1e-30, 1e30
-"""The least and the greatest width of a range: float32 can hold their squares."""
+MIN_WIDTH, MAX_WIDTH = 1e-30, 1e30
+"""Widths of which float32 can hold the squares."""
 
 
-def check_widths(low: Tensor, high: Tensor) -> None:
-    """Raise ValueError where the numbers between bounds `low` and `high [D]` are too few, or too large, for float32."""
-    width = high - low
-    fits = (width > COARSEST * torch.maximum(low.abs(), high.abs())) & (width > WIDTHS[0]) & (width < WIDTHS[1])
+def check_bounds(low: Tensor, high: Tensor) -> None:
+    """Raise ValueError unless these are finite bounds `[D]` of ranges that float32 resolves, D of 1 or more."""
+    if low.dim() != 1 or low.shape != high.shape or not len(low):
+        raise ValueError(
+            f"`action_low` and `action_high` must have shape [D], got {list(low.shape)} and {list(high.shape)}"
+        )
+    width, size = high - low, torch.maximum(low.abs(), high.abs())
+    fits = (width > MIN_RELATIVE_WIDTH * size) & (width > MIN_WIDTH) & (width < MAX_WIDTH)
     if not fits.all():
         d = int((~fits).nonzero()[0, 0])
         raise ValueError(
-            f"action_low[{d}], action_high[{d}]: a range that float32 resolves is expected (1e-30 to 1e30 wide, and at"
-            f" least {COARSEST:g} of its bounds), not {float(low[d]):g} to {float(high[d]):g}"
+            f"`action_low` must be below `action_high` by {MIN_WIDTH:g} to {MAX_WIDTH:g} and at least"
+            f" {MIN_RELATIVE_WIDTH:g} of the bounds, got {float(low[d]):g} and {float(high[d]):g} in dimension {d}"
         )
 
 
-def same_bounds(bound: Tensor, other: Tensor, width: Tensor) -> bool:
-    """Whether two bounds `[D]` of ranges of `width [D]` are the same, but for a hundred-thousandth of the range."""
-    return bound.shape == other.shape and bool(((bound - other).abs() <= 1e-5 * width).all())
+def check_vectors(name: str, vectors: Tensor, low: Tensor, high: Tensor) -> None:
+    """Raise ValueError unless `vectors [..., D]` are floating point numbers between `low [D]` and `high [D]`.
+
+    A millionth of the range beyond the bounds is taken for rounding.
+    """
+    if not vectors.is_floating_point() or not vectors.dim() or vectors.shape[-1] != len(low):
+        raise ValueError(
+            f"`{name}` must be floating point vectors of {len(low)} numbers, got {vectors.dtype} {list(vectors.shape)}"
+        )
+    slack = 1e-6 * (high - low)
+    inside = (vectors >= low - slack) & (vectors <= high + slack)
+    if not inside.all():
+        where = (~inside).nonzero()[0].tolist()
+        d = where[-1]
+        raise ValueError(
+            f"`{name}` must be between the bounds {float(low[d]):g} and {float(high[d]):g} of dimension {d}, got"
+            f" {float(vectors[tuple(where)]):g} at {where}"
+        )
+
+
+def check_finite(name: str, values: Tensor) -> None:
+    """Raise ValueError unless all of `values` are finite."""
+    if not values.isfinite().all():
+        where = (~values.isfinite()).nonzero()[0].tolist()
+        raise ValueError(f"`{name}` must be finite, got {float(values[tuple(where)])} at {where}")
 
 
 def as_floats(name: str, values: object) -> Tensor:
     """Floating point numbers as float32; ValueError for anything else."""
-    try:
-        tensor = torch.as_tensor(values)
-    except (OverflowError, RuntimeError, TypeError, ValueError):
-        raise ValueError(f"{name}: an array of numbers is expected, not {type(values).__name__}") from None
+    tensor = _as_tensor(name, values)
     if not tensor.is_floating_point() and not is_integer(tensor):
-        raise ValueError(f"{name}: numbers are expected, not {tensor.dtype}")
+        raise ValueError(f"`{name}` must be numbers, got {tensor.dtype}")
     return tensor.detach().float()
 
 
-def _integers(name: str, values: object) -> Tensor:
-    """`values` as a tensor, whose dtype is checked later; ValueError for what cannot be one."""
+def _integers(name: str, values: object, num: int) -> Tensor:
+    """Integers `[num]`; ValueError for anything else."""
+    tensor = _as_tensor(name, values)
+    if not is_integer(tensor) or tensor.shape != (num,):
+        raise ValueError(f"`{name}` must be integers of shape [{num}], got {tensor.dtype} {list(tensor.shape)}")
+    return tensor
+
+
+def _as_tensor(name: str, values: object) -> Tensor:
     try:
         return torch.as_tensor(values)
     except (OverflowError, RuntimeError, TypeError, ValueError):
-        raise ValueError(f"{name}: integers are expected, not {type(values).__name__}") from None
+        raise ValueError(f"`{name}` must be numbers, got {type(values).__name__}") from None

@@ -16,7 +16,7 @@ class PriorModule(lightning.LightningModule):
 
     Args:
         prior: any module with `forward(plans, context) -> logits [N, L, A]`; for plans longer than a window it needs
-            `forward_from` too, see `NeuralPrior`. For vectors, one with `log_probs_from`, see `VectorNetwork`.
+            `forward_from` too, see `NeuralPrior`. For vectors, one with `log_probs_from`, see `VectorGRU`.
         learning_rate: of AdamW, after the first tenth of the steps; it falls to 0 with half a cosine.
         weight_decay: of AdamW.
         seed: of dropout.

@@ -48,7 +48,7 @@ def train(prior: nn.Module, plans: Sequences, settings: Settings, seed: int) -> 
     Args:
         prior: any module with `forward(plans, context) -> logits [N, L, A]`; one without `forward_from` (see
             `NeuralPrior`) is trained on whole plans, however long. For plans of vectors, one with `log_probs_from` (see
-            `VectorNetwork`).
+            `VectorGRU`).
         plans: at least two plans (two groups, where there are any), each with an action; or a single long one, whose
             end is then held out.
         settings: how.

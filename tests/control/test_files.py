@@ -78,7 +78,7 @@ def test_minari_with_a_box_of_actions(bounded, tmp_path, monkeypatch):
             observation_space=Box(-1, 1, (3,), np.float32),
         )
     if not bounded:
-        with pytest.raises(ValueError, match=r"arm/random-v0: actions of the space .* finite bounds are expected"):
+        with pytest.raises(ValueError, match="arm/random-v0: actions must have finite bounds"):
             read_vector_plans("minari:arm/random-v0")
         return
     plans = read_vector_plans("minari:arm/random-v0")
@@ -103,27 +103,15 @@ def test_arrays_of_other_names_are_warned_of(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (([{"actions": np.ones((3, 2))}], -1.0, 1.0), r"action_low, action_high: .* not of shape \[\] and \[\]"),
-        (([{"actions": np.ones((3, 2))}], [-1.0], HIGH), r"action_low, action_high: .* \[1\] and \[2\]"),
-        (([{"actions": np.ones((3, 2))}], None, None), "action_low: object values; numbers"),
+        (([{"actions": np.ones((3, 2))}], [-1.0], HIGH), r"`action_low` and `action_high` must have .*\[1\] and \[2\]"),
+        (([{"actions": np.ones((3, 2))}], None, None), "action_low"),
         (({"actions": np.ones((3, 2))}, LOW, HIGH), "put it in a list"),
-        (({"a": {"actions": np.ones((3, 2))}}, LOW, HIGH), "trajectories: a list of them is expected, not a dict"),
+        (([], LOW, HIGH), "`trajectories` must have at least one"),
     ],
 )
 def test_what_is_wrong_with_trajectories_is_named(arguments, message):
     with pytest.raises(ValueError, match=message):
         vector_plans_from_trajectories(*arguments)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
-def test_tensors_that_need_gradients_are_read(dtype):
-    actions = torch.full((3, 2), 0.5, requires_grad=True, dtype=dtype)
-    assert vector_plans_from_trajectories([{"actions": actions}], LOW, HIGH).actions.tolist() == [[[0.5, 0.5]] * 3]
-
-
-def test_vectors_have_a_dimension():
-    with pytest.raises(ValueError, match="D of 1 or more"):
-        VectorPlans(torch.zeros(3, 2, 0), [], [])
 
 
 def test_readers_name_one_another(tmp_path):
@@ -142,13 +130,13 @@ def test_readers_name_one_another(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"action_low": None}, "no array 'action_low'"),
-        ({"actions": np.full((2, 3, 2), np.nan)}, "is not between the bounds"),
-        ({"actions": np.full((2, 3, 2), 5.0)}, "is not between the bounds"),
-        ({"actions": np.full((2, 3, 2), "x")}, "an array of numbers is expected"),
+        ({"action_low": None}, "`action_low` is missing"),
+        ({"actions": np.full((2, 3, 2), np.nan)}, "`actions` must be between the bounds"),
+        ({"actions": np.full((2, 3, 2), "x")}, "`actions` must be numbers"),
+        ({"actions": np.zeros((2, 3, 0)), "action_low": [], "action_high": []}, r"must have shape \[D\]"),
         ({"lengths": np.array([1, 9])}, "lengths"),
-        ({"action_high": np.array([1.0])}, "action_high: 2 finite numbers"),
-        ({"action_names": np.array(["hip"])}, "action_names: 2 are expected"),
+        ({"action_high": np.array([1.0])}, r"`action_high` must have shape \[2\]"),
+        ({"action_names": np.array(["hip"])}, "`action_names` must be a list of 2 names"),
     ],
 )
 def test_wrong_files(tmp_path, change, message):
@@ -171,16 +159,3 @@ def test_damaged_files_are_refused_in_one_line_or_read(tmp_path, cut, byte):
     except ValueError as error:
         assert "plans.npz" in str(error)  # noqa: PT017
         assert "\n" not in str(error)  # noqa: PT017
-
-
-JUNK = st.one_of(st.none(), st.integers(), st.text(max_size=3), st.lists(st.floats(), max_size=3), st.floats())
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.lists(st.one_of(JUNK, st.dictionaries(st.sampled_from(["actions", "observations"]), JUNK)), max_size=3))
-def test_junk_is_refused_or_empty(trajectories):
-    try:
-        plans = vector_plans_from_trajectories(trajectories, LOW, HIGH)
-    except ValueError:
-        return
-    assert not plans.mask().any()

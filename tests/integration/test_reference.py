@@ -49,7 +49,6 @@ WITHOUT_EXAMPLE = {
         *(
             "BestFirstPlanner",
             "ContinuousWorld",
-            "Forecast",
             "HistoryPrior",
             "MujocoWorld",
             "NeuralPrior",

@@ -54,8 +54,7 @@ class Drift(VectorPrior):
         std = torch.tensor(self.std).expand_as(mean)[:, None]
         return GaussianForecast(mean[:, None], std, self.action_low, self.action_high), mean
 
-    def fit(self, plans, *, generator=None, **settings):
-        self.check_settings(settings)
+    def fit(self, plans, *, generator=None):
         self.training_plans(plans)
         return self
 

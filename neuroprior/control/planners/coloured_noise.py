@@ -1,20 +1,18 @@
 """Gaussian noise in time with a power-law spectrum."""
 
 from functools import lru_cache
-from math import inf, sqrt
+from math import sqrt
 
 import torch
 from torch import Tensor
 
-from neuroprior._checks import is_number
+from neuroprior.control.worlds.continuous_world import check_positive
 
 
 def check_noise(std: float, noise_beta: float) -> None:
     """Raise ValueError unless these are a standard deviation, and an exponent of a spectrum."""
-    if not is_number(std) or not 0 < std < inf:
-        raise ValueError(f"std: a positive finite number is expected, not {std!r}")
-    if not is_number(noise_beta) or not 0 <= noise_beta < inf:
-        raise ValueError(f"noise_beta: a finite number of at least 0 is expected, not {noise_beta!r}")
+    check_positive(std=std)
+    check_positive(zero=True, noise_beta=noise_beta)
 
 
 def coloured_noise(shape: tuple[int, ...], beta: float, generator: torch.Generator) -> Tensor:

@@ -6,11 +6,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_sizes
+from neuroprior._checks import check_memory, check_sizes, kind_of
 from neuroprior._random import generator_on
 from neuroprior.control.planners.vector_planner import Memory, VectorPlanner
 from neuroprior.control.vector_plans import VectorPlans
-from neuroprior.control.worlds.continuous_world import ContinuousWorld, check_is_continuous, outcome_of
+from neuroprior.control.worlds.continuous_world import ContinuousWorld, check_is_continuous, check_outcome
 
 
 class Control(NamedTuple):
@@ -69,16 +69,14 @@ def control(
     check_sizes(num_steps=num_steps, replan_every=replan_every)
     check_memory(8 * num_steps, num_steps=num_steps)
     if replan_every > planner.length:
-        raise ValueError(
-            f"replan_every: at most the {planner.length} vectors of a plan are expected, not {replan_every}"
-        )
+        raise ValueError(f"`replan_every` must be at most the length of a plan, {planner.length}, got {replan_every}")
     check_is_continuous(world)
     world.check_state(state)
     generator, batch, seconds = generator_on(generator, state.device), len(state), 0.0
     actions = torch.zeros(batch, num_steps, world.action_size, device=state.device)
     observed = world.observe(state)
     if not isinstance(observed, Tensor) or not observed.is_floating_point() or observed.shape[:-1] != (batch,):
-        raise ValueError(f"observe: floating point features [{batch}, C] are expected, not {_kind(observed)}")
+        raise ValueError(f"`observe` must return floating point features [{batch}, C], got {_kind(observed)}")
     seen = observed.new_zeros(batch, num_steps, *observed.shape[1:])
     rewards = torch.zeros(batch, num_steps, device=state.device)
     states = state[:, None].repeat(1, num_steps + 1, *[1] * (state.dim() - 1))
@@ -99,7 +97,7 @@ def control(
             model_steps[running] += decision.model_steps
         assert memory is not None
         action, observation = plan[:, t % replan_every], world.observe(now)
-        now, reward = outcome_of(now, world.step(now, action, generator))
+        now, reward = check_outcome(now, world.step(now, action, generator))
         rewards = rewards.to(torch.promote_types(rewards.dtype, reward.dtype))
         actions[running, t], seen[running, t], rewards[running, t] = action, observation, reward.to(rewards.dtype)
         states[running, t + 1] = now
@@ -125,9 +123,9 @@ def _ended(world: ContinuousWorld, state: Tensor) -> Tensor:
     """`world.terminated(state)`, checked: integers would be taken for the numbers of runs."""
     ended = world.terminated(state)
     if not isinstance(ended, Tensor) or ended.dtype != torch.bool or ended.shape != state.shape[:1]:
-        raise ValueError(f"terminated: bool [{len(state)}] is expected, not {_kind(ended)}")
+        raise ValueError(f"`terminated` must return bool [{len(state)}], got {_kind(ended)}")
     return ended
 
 
 def _kind(value: object) -> str:
-    return f"{value.dtype} {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+    return f"{value.dtype} {list(value.shape)}" if isinstance(value, Tensor) else kind_of(value)

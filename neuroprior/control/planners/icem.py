@@ -6,21 +6,30 @@ from typing import Unpack
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_share, check_sizes, is_number
+from neuroprior._checks import check_sizes
 from neuroprior.control.planners.coloured_noise import check_noise, coloured_noise
 from neuroprior.control.planners.vector_planner import (
     Memory,
     Proposal,
     VectorDecision,
     VectorPlanner,
-    filled,
+    fill_plan,
     middle_and_half,
 )
 from neuroprior.control.worlds.continuous_world import ContinuousWorld
 from neuroprior.planners.planner import random_top
 
-SMALLEST_POPULATION = 4
+MIN_POPULATION = 4
 """Candidates in an iteration, at least, where there are as many: two elites, and twice as many to choose them from."""
+
+DECAY = 1.25
+"""An iteration has so many times fewer candidates than the one before, as in the paper."""
+
+KEPT_SHARE = 0.3
+"""The share of the elites that goes on to the next iteration and decision, as in the paper; at least one does."""
+
+MOMENTUM = 0.1
+"""The share of the old mean and standard deviation in the refitted ones, as in the paper."""
 
 
 class ICEMPlanner(VectorPlanner):
@@ -34,7 +43,7 @@ class ICEMPlanner(VectorPlanner):
     decision is the best candidate of all; the next one starts from the mean, without what was executed and its last
     vector repeated, and from the first standard deviation.
 
-    All candidates that are simulated count: `num_plans` is their number over all iterations, of which each has `decay`
+    All candidates that are simulated count: `num_plans` is their number over all iterations, of which each has 1.25
     times fewer than the one before (rounded; shifted elites and the mean are among them). There are fewer iterations
     where the last would otherwise have less than four candidates. There are at most half as many elites as the last
     iteration has candidates, and at least two. With 97 candidates the defaults are the reference's 40, 32 and 25 with
@@ -49,10 +58,6 @@ class ICEMPlanner(VectorPlanner):
         length, num_plans: see `VectorPlanner`.
         iterations: at most so many.
         elites: K, at most so many.
-        decay: of the number of candidates from one iteration to the next, at least 1.
-        keep_elites: the share of the elites that goes on to the next iteration and to the next decision: rounded down,
-            but at least one if it is above 0.
-        momentum: the share of the old mean and standard deviation in the refitted ones, below 1.
         std: the first standard deviation, as a share of half the range of each dimension.
         noise_beta: exponent of the noise's spectrum, see `coloured_noise`. The paper chooses it task by task, from 0.25
             (running) to 4.
@@ -80,9 +85,6 @@ class ICEMPlanner(VectorPlanner):
         *,
         iterations: int = 3,
         elites: int = 10,
-        decay: float = 1.25,
-        keep_elites: float = 0.3,
-        momentum: float = 0.1,
         std: float = 0.5,
         noise_beta: float = 3.0,
         prior_iterations: int | None = 1,
@@ -93,15 +95,10 @@ class ICEMPlanner(VectorPlanner):
         if prior_iterations is not None:
             check_sizes(prior_iterations=prior_iterations)
         check_noise(std, noise_beta)
-        check_share("keep_elites", keep_elites)
-        if not is_number(decay) or not 1 <= decay < float("inf"):
-            raise ValueError(f"decay: a finite number of at least 1 is expected, not {decay!r}")
-        if not is_number(momentum) or not 0 <= momentum < 1:
-            raise ValueError(f"momentum: a number from 0 to below 1 is expected, not {momentum!r}")
-        self.populations = populations(num_plans, iterations, decay)
+        self.populations = populations(num_plans, iterations)
         self.num_elites = max(min(elites, self.populations[-1] // 2), 2)
-        self.num_kept = max(int(keep_elites * self.num_elites + 1e-9), 1) if keep_elites else 0
-        self.momentum, self.std, self.noise_beta = momentum, std, noise_beta
+        self.num_kept = max(int(KEPT_SHARE * self.num_elites + 1e-9), 1)
+        self.std, self.noise_beta = std, noise_beta
         self.prior_iterations = len(self.populations) if prior_iterations is None else prior_iterations
 
     def plan(
@@ -114,7 +111,7 @@ class ICEMPlanner(VectorPlanner):
         generator, memory = self.begin(world, state, generator, memory)
         low, high = world.action_low.to(state.device), world.action_high.to(state.device)
         middle, half = middle_and_half(world, state.device)
-        mean = filled(memory.mean, len(state), self.length, middle, repeat=True)
+        mean = fill_plan(memory.mean, len(state), self.length, middle, repeat=True)
         std = first = (self.std * half).expand_as(mean)
         shifted = self._shifted(memory.elites, mean, std, generator)
         # An iteration draws at least one candidate.
@@ -148,7 +145,7 @@ class ICEMPlanner(VectorPlanner):
             best_score = torch.where(better, elite_score[:, 0], best_score)
             centre = elites.mean(1)
             spread = (elites - centre[:, None]).square().mean(1).sqrt()
-            mean, std = torch.lerp(centre, mean, self.momentum), torch.lerp(spread, std, self.momentum)
+            mean, std = torch.lerp(centre, mean, MOMENTUM), torch.lerp(spread, std, MOMENTUM)
         kept = memory._replace(mean=mean, elites=elites[:, : self.num_kept], wins=shares.wins)
         return VectorDecision(best, best_score, self.num_plans * self.length, kept)
 
@@ -163,16 +160,16 @@ class ICEMPlanner(VectorPlanner):
         return torch.cat([elites, (mean[:, None] + std[:, None] * noise)[:, :, kept:]], 2)
 
 
-def populations(num_plans: int, iterations: int, decay: float) -> list[int]:
-    """`num_plans` divided among at most so many iterations, each with `decay` times fewer than the one before.
+def populations(num_plans: int, iterations: int) -> list[int]:
+    """`num_plans` divided among at most so many iterations, each with `DECAY` times fewer than the one before.
 
     Fractions are rounded so that the sum is exact; iterations are left out at the end until each has at least
-    `SMALLEST_POPULATION`.
+    `MIN_POPULATION`.
     """
     for number in range(min(iterations, num_plans), 0, -1):
-        shares = [decay**-i for i in range(number)]
+        shares = [DECAY**-i for i in range(number)]
         up_to = [round(num_plans * sum(shares[: i + 1]) / sum(shares)) for i in range(number)]
         sizes = [after - before for before, after in pairwise([0, *up_to])]
-        if number == 1 or min(sizes) >= SMALLEST_POPULATION:
+        if number == 1 or min(sizes) >= MIN_POPULATION:
             break
     return sizes

@@ -5,14 +5,13 @@ from typing import Unpack
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
 from neuroprior.control.planners.coloured_noise import check_noise, coloured_noise
 from neuroprior.control.planners.vector_planner import (
     Memory,
     Proposal,
     VectorDecision,
     VectorPlanner,
-    filled,
+    fill_plan,
     middle_and_half,
 )
 from neuroprior.control.worlds.continuous_world import ContinuousWorld
@@ -41,8 +40,6 @@ class MPPIPlanner(VectorPlanner):
         control_cost: of each own candidate, the sum over its entries of `u * e / std ** 2` is taken from the logarithm
             of its weight, where u is the plan so far, from the middle of the range, and e the clipped noise (the
             paper's cost of control with base distribution at the middle of the range, and gamma = temperature).
-        iterations: the candidates are drawn in so many rounds, each around the average of the one before; at most as
-            many as there are candidates.
         noise_beta: exponent of the noise's spectrum, see `coloured_noise`; 0, as in the paper: white noise.
         **proposal: prior, prior_share, adapt_share, prior_as, discount, value: see `VectorPlanner`.
 
@@ -66,18 +63,18 @@ class MPPIPlanner(VectorPlanner):
         temperature: float = 0.1,
         normalise: bool = True,
         control_cost: bool = False,
-        iterations: int = 1,
         noise_beta: float = 0.0,
         **proposal: Unpack[Proposal],
     ) -> None:
         super().__init__(length, num_plans, **proposal)
-        check_sizes(iterations=iterations)
         check_noise(std, noise_beta)
         check_temperature(temperature)
         if control_cost and noise_beta:
-            raise ValueError("control_cost: it is defined for white noise; leave noise_beta at 0")
+            raise ValueError(
+                f"`noise_beta` must be 0 with a `control_cost`, which is defined for white noise, got {noise_beta}"
+            )
         self.std, self.temperature, self.normalise, self.control_cost = std, temperature, normalise, control_cost
-        self.iterations, self.noise_beta = min(iterations, num_plans), noise_beta
+        self.noise_beta = noise_beta
 
     def plan(
         self,
@@ -89,34 +86,28 @@ class MPPIPlanner(VectorPlanner):
         generator, memory = self.begin(world, state, generator, memory)
         low, high = world.action_low.to(state.device), world.action_high.to(state.device)
         middle, half = middle_and_half(world, state.device)
-        mean = filled(memory.mean, len(state), self.length, middle, repeat=False)
-        rounds = range(self.iterations)
-        drawn = [self.num_plans * (i + 1) // len(rounds) - self.num_plans * i // len(rounds) for i in rounds]
-        shares = self.shares(drawn, memory, generator)
-        best_scores = []
-        for i, proposed in enumerate(self.proposals(shares, world, state, memory, generator)):
-            noise = coloured_noise((len(state), shares.most[i][0], *mean.shape[1:]), self.noise_beta, generator)
-            own = mean[:, None] + self.std * half * noise
-            plans = shares.mixed(i, own, self.around(mean, proposed)).clamp(low, high)
-            score = self.scores(world, state, plans, generator)
-            if i == 0:
-                shares.observe(score)
-            logits = self._logits(score)
-            if self.control_cost:
-                control = (mean - middle)[:, None] / (self.std * half).square()
-                cost = (control * (plans - mean[:, None])).sum((-2, -1))
-                logits = logits - torch.where(shares.is_prior(i), 0, cost)
-            weights = logits.softmax(1).to(plans.dtype)
-            mean = (weights[:, None] @ plans.flatten(2)).view_as(mean).clamp(low, high)
-            best_scores.append(score.amax(1))
-        best = torch.stack(best_scores).amax(0)
+        mean = fill_plan(memory.mean, len(state), self.length, middle, repeat=False)
+        shares = self.shares([self.num_plans], memory, generator)
+        (proposed,) = self.proposals(shares, world, state, memory, generator)
+        noise = coloured_noise((len(state), shares.most[0][0], *mean.shape[1:]), self.noise_beta, generator)
+        own = mean[:, None] + self.std * half * noise
+        plans = shares.mixed(0, own, self.around(mean, proposed)).clamp(low, high)
+        score = self.scores(world, state, plans, generator)
+        shares.observe(score)
+        logits = self._logits(score)
+        if self.control_cost:
+            control = (mean - middle)[:, None] / (self.std * half).square()
+            cost = (control * (plans - mean[:, None])).sum((-2, -1))
+            logits = logits - torch.where(shares.is_prior(0), 0, cost)
+        weights = logits.softmax(1).to(plans.dtype)
+        mean = (weights[:, None] @ plans.flatten(2)).view_as(mean).clamp(low, high)
         kept = memory._replace(mean=mean, elites=None, wins=shares.wins)
-        return VectorDecision(mean, best, self.num_plans * self.length, kept)
+        return VectorDecision(mean, score.amax(1), self.num_plans * self.length, kept)
 
     def _logits(self, score: Tensor) -> Tensor:
         """The logarithms of the weights `[B, P]`, up to a constant in each row."""
         if not score.isfinite().all():
-            raise ValueError("score: finite numbers are expected, of which MPPI makes weights; a score is infinite")
+            raise ValueError("`score` must be finite, of which MPPI makes weights, got an infinite one")
         score = score.double()  # differences of scores near the limits of float32 would be infinite
         less = score - score.amax(1, keepdim=True)
         if self.normalise:

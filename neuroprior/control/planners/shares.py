@@ -7,15 +7,13 @@ from math import ceil, log
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_count, check_share
-
-KEPT = 0.95
+KEPT_PER_DECISION = 0.95
 """From one decision to the next, the numbers of the decisions before are multiplied by this."""
 
-EVEN = 0.5
+EVEN_DECISIONS = 0.5
 """So many decisions are counted besides, in which candidates of both kinds were equally often the best."""
 
-LEAST = 0.05
+MIN_ODDS_RATIO = 0.05
 """The odds fall to no less than this part of those of the share: the prior is still tried."""
 
 
@@ -47,10 +45,7 @@ class Shares:
         counts: int64 `[B, I]`: the candidates of each iteration that are the prior's.
         most: for each iteration the numbers of own candidates and of the prior's that have to be drawn for each start.
         wins: `[B, 2, 2]`: for the prior's candidates and the own ones, how often one was the best, and their number.
-            Earlier decisions count less, by the factor `KEPT` for each decision since. None where nothing adapts.
-
-    Raises:
-        ValueError: a share that is not between 0 and 1, numbers that are no counts, or `wins` of another shape.
+            Earlier decisions count less, by the factor `KEPT_PER_DECISION` for each since. None where nothing adapts.
 
     Example:
         >>> shares = Shares([6, 4], 0.5, 1, torch.Generator().manual_seed(0), adapt=True)
@@ -73,23 +68,15 @@ class Shares:
         adapt: bool = False,
         wins: Tensor | None = None,
     ) -> None:
-        for size in drawn:
-            check_count("drawn", size, 0)
-        check_count("batch_size", batch_size, 0)
-        check_share("share", share)
-        if wins is not None and wins.shape != (batch_size, 2, 2):
-            raise ValueError(
-                f"wins: [{batch_size}, 2, 2] are expected, as `wins` of the decision before, not {list(wins.shape)}"
-            )
         self.drawn, device = list(drawn), generator.device
-        fixed = _fixed(share, [sum(drawn[:iterations][: i + 1]) for i in range(len(drawn))])
+        fixed = _fixed_counts(share, [sum(drawn[:iterations][: i + 1]) for i in range(len(drawn))])
         self.counts = torch.tensor(fixed, device=device).expand(batch_size, -1)
         adapt = adapt and 0 < share < 1
         self.wins = torch.zeros(batch_size, 2, 2, device=device) if adapt else None
         self._may_differ = adapt and wins is not None
         if adapt and wins is not None:
-            self.wins = KEPT * wins
-            left = _share_after(share, EVEN * drawn[0], wins) / share
+            self.wins = KEPT_PER_DECISION * wins
+            left = _adapted_share(share, EVEN_DECISIONS * drawn[0], wins) / share
             up_to = left[:, None] * self.counts.cumsum(1)
             whole = (up_to + torch.rand(batch_size, 1, generator=generator, device=device)).long()
             self.counts = whole.diff(dim=1, prepend=torch.zeros_like(whole[:, :1]))
@@ -136,16 +123,16 @@ class Shares:
         self.wins = self.wins + torch.stack([(best > best_other) & (number > 0), number], -1)
 
 
-def _share_after(share: float, even: float, wins: Tensor) -> Tensor:
+def _adapted_share(share: float, even: float, wins: Tensor) -> Tensor:
     """The share `[B]` after `wins`; so many candidates of each kind that win as often as all do are counted besides."""
     won, number = wins.unbind(-1)
     mean = won.sum(1, keepdim=True) / number.sum(1, keepdim=True)
     prior, own = ((won + even * mean) / (number + even)).log().unbind(1)
-    ratio = torch.where(mean[:, 0] > 0, prior - own, 0).clamp(log(LEAST), 0)  # nobody won: nothing is known
+    ratio = torch.where(mean[:, 0] > 0, prior - own, 0).clamp(log(MIN_ODDS_RATIO), 0)  # nobody won: nothing is known
     return torch.where(ratio < 0, (torch.tensor(share, device=wins.device).logit() + ratio).sigmoid(), share)
 
 
-def _fixed(share: float, ends: Sequence[int]) -> list[int]:
+def _fixed_counts(share: float, ends: Sequence[int]) -> list[int]:
     """How many candidates of each iteration are the prior's, of so many that are drawn up to its end."""
     total = ends[-1] if ends else 0
     wanted = round(share * total)

@@ -11,7 +11,7 @@ from neuroprior.control.planners.vector_planner import (
     Proposal,
     VectorDecision,
     VectorPlanner,
-    filled,
+    fill_plan,
     middle_and_half,
 )
 from neuroprior.control.worlds.continuous_world import ContinuousWorld
@@ -21,15 +21,14 @@ from neuroprior.planners.planner import random_best
 class ShootingPlanner(VectorPlanner):
     """Draws `num_plans` candidates and decides for the best; of equally good ones for a random one.
 
-    Its own candidates are Gaussian noise, clipped to the bounds: around the middle of the range, or with `warm_start`
-    around what is left of the last plan, its last vector repeated. That plan itself is then a candidate, too, so that
-    in a deterministic world the new plan is at least as good.
+    Its own candidates are Gaussian noise, clipped to the bounds: around the middle of the range, or around what is left
+    of the last plan, its last vector repeated. That plan itself is then a candidate, too, so that in a deterministic
+    world the new plan is at least as good.
 
     Args:
         length, num_plans: see `VectorPlanner`.
         std: standard deviation of the noise, as a share of half the range of each dimension.
         noise_beta: exponent of its spectrum, see `coloured_noise`; 0: white noise.
-        warm_start: search around the last plan, where there is one.
         **proposal: prior, prior_share, adapt_share, prior_as, discount, value: see `VectorPlanner`.
 
     Raises:
@@ -50,12 +49,11 @@ class ShootingPlanner(VectorPlanner):
         *,
         std: float = 0.5,
         noise_beta: float = 0.0,
-        warm_start: bool = True,
         **proposal: Unpack[Proposal],
     ) -> None:
         super().__init__(length, num_plans, **proposal)
         check_noise(std, noise_beta)
-        self.std, self.noise_beta, self.warm_start = std, noise_beta, warm_start
+        self.std, self.noise_beta = std, noise_beta
 
     def plan(
         self,
@@ -66,10 +64,9 @@ class ShootingPlanner(VectorPlanner):
     ) -> VectorDecision:
         generator, memory = self.begin(world, state, generator, memory)
         middle, half = middle_and_half(world, state.device)
-        last = memory.mean if self.warm_start else None
-        mean = filled(last, len(state), self.length, middle, repeat=True)
+        mean = fill_plan(memory.mean, len(state), self.length, middle, repeat=True)
         # A single candidate is drawn: else the plan would never change.
-        again = last is not None and self.num_plans > 1
+        again = memory.mean is not None and self.num_plans > 1
         drawn = self.num_plans - again
         shares = self.shares([drawn], memory, generator)
         (proposed,) = self.proposals(shares, world, state, memory, generator)

@@ -7,11 +7,10 @@ from typing import Literal, NamedTuple, TypedDict
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_flags, check_same_names, check_share, check_sizes
+from neuroprior._checks import check_flags, check_same_names, check_share, check_sizes, kind_of
 from neuroprior._random import generator_on
 from neuroprior.control.planners.shares import Shares
 from neuroprior.control.priors.vector_prior import VectorPrior
-from neuroprior.control.vector_plans import same_bounds
 from neuroprior.control.worlds.continuous_world import ContinuousWorld, check_is_continuous
 from neuroprior.planners.planner import check_objective, value_of
 
@@ -131,14 +130,14 @@ class VectorPlanner(ABC):
         check_sizes(length=length, num_plans=num_plans)
         check_objective("return", discount)
         if prior is not None and not isinstance(prior, VectorPrior):
-            raise ValueError(f"prior: a VectorPrior is expected, not {type(prior).__name__}")
+            raise ValueError(f"`prior` must be a VectorPrior, got {kind_of(prior)}")
         share = prior_share if prior_share is not None else 0.0 if prior is None else 0.5
         check_share("prior_share", share)
         if share and prior is None:
-            raise ValueError("prior_share: there is no prior; give prior=")
+            raise ValueError(f"`prior_share` must be 0 without a prior, got {share}")
         check_flags(adapt_share=adapt_share)
         if prior_as not in ("plans", "noise"):
-            raise ValueError(f'prior_as: "plans" or "noise" is expected, not {prior_as!r}')
+            raise ValueError(f'`prior_as` must be "plans" or "noise", got {prior_as!r}')
         self.length, self.num_plans, self.discount, self.value = length, num_plans, discount, value
         self.prior, self.prior_share, self.adapt_share, self.prior_as = prior, share, adapt_share, prior_as
 
@@ -176,24 +175,20 @@ class VectorPlanner(ABC):
         world.check_state(state)
         size = world.action_size
         if self.prior is not None:
-            for name in ("action_low", "action_high"):
-                own, there = getattr(self.prior, name), getattr(world, name).to(self.prior.device)
-                if not same_bounds(own, there, 2 * self.prior.half_range):
-                    raise ValueError(f"prior: its {name} is {own.tolist()}, the world's {there.tolist()}")
+            self.prior.check_same_bounds(world, "the world")
             check_same_names("action_names", self.prior.action_names, world.action_names, "the world", "the prior")
         if memory is None:
             observed = world.observe(state)
             past = torch.zeros(len(state), 0, size, device=state.device)
             memory = Memory(past, observed.new_zeros(len(state), 0, *observed.shape[1:]))
         if not isinstance(memory, Memory):
-            raise ValueError(f"memory: that of a decision is expected (decision.memory), not {type(memory).__name__}")
-        for name, values in (("past", memory.past), ("mean", memory.mean), ("elites", memory.elites)):
-            if values is not None and (len(values) != len(state) or values.shape[-1] != size):
+            raise ValueError(f"`memory` must be that of a decision (decision.memory), got {kind_of(memory)}")
+        for name, values in memory._asdict().items():
+            last = {"observations": None, "wins": 2}.get(name, size)
+            if values is not None and (len(values) != len(state) or last not in (None, values.shape[-1])):
                 raise ValueError(
-                    f"memory: {name} of shape [{len(state)}, ..., {size}] is expected, not {list(values.shape)}"
+                    f"`memory.{name}` must have shape [{len(state)}, ..., {last or 'C'}], got {list(values.shape)}"
                 )
-        if memory.wins is not None and memory.wins.shape != (len(state), 2, 2):
-            raise ValueError(f"memory: wins of shape [{len(state)}, 2, 2] is expected, not {list(memory.wins.shape)}")
         return generator_on(generator, state.device), memory
 
     def shares(
@@ -222,7 +217,8 @@ class VectorPlanner(ABC):
             observed = world.observe(state)
             if observed.shape[1:] != (self.prior.context_size,):
                 raise ValueError(
-                    f"prior: it takes {self.prior.context_size} features, the world shows {list(observed.shape[1:])}"
+                    f"`prior` must take the features of the world, {list(observed.shape[1:])}, got one that takes"
+                    f" {self.prior.context_size}"
                 )
             context = torch.cat([memory.observations, observed[:, None]], 1)
         noise = self.prior_as == "noise"
@@ -248,7 +244,7 @@ class VectorPlanner(ABC):
             value = value_of(self.value, final_state.flatten(0, 1)).view_as(score)
             score = score + self.discount**self.length * value.to(score.dtype)
         if score.isnan().any():
-            raise ValueError("score: NaN; a reward of the world, or its value, is not a number")
+            raise ValueError("`score` must be a number, got NaN: a reward of the world, or its value, is none")
         return score
 
 
@@ -258,7 +254,7 @@ def middle_and_half(world: ContinuousWorld, device: torch.device) -> tuple[Tenso
     return (low + high) / 2, (high - low) / 2
 
 
-def filled(mean: Tensor | None, batch_size: int, length: int, middle: Tensor, repeat: bool) -> Tensor:
+def fill_plan(mean: Tensor | None, batch_size: int, length: int, middle: Tensor, repeat: bool) -> Tensor:
     """The plan `[B, L, D]` to search around, of what is left of the last one.
 
     Args:

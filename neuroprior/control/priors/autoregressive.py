@@ -7,12 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from neuroprior._checks import check_count, check_memory
 from neuroprior._random import draw_seed
 from neuroprior.control.priors.linear_gaussian import (
     LinearGaussianPrior,
     WindowMoments,
-    best_of,
-    check_order,
     held_out_split,
     moments_or_white,
 )
@@ -23,10 +22,10 @@ SHARES = (1.0, 0.3, 0.1, 0.0)
 """Shares by which what different dimensions have in common is reduced: with few vectors it is mostly chance. Held-out
 likelihood chooses; of equals it takes the first."""
 
-FOLDS, MOST_IN_FOLDS = 5, 500
+NUM_FOLDS, MAX_VECTORS_IN_FOLDS = 5, 500
 """Parts that are held out in turn, of so many vectors at most: one part alone would say too little."""
 
-MANY = 20
+ENOUGH_WINDOWS = 20
 """Windows for each number in one from which nothing is reduced."""
 
 RIDGES = (1e-5, 1e-3, 1e-1)
@@ -59,7 +58,8 @@ class AutoregressivePrior(LinearGaussianPrior):
     def __init__(self, action_low: Any, action_high: Any, order: int | None = None) -> None:
         super().__init__(action_low, action_high)
         if order is not None:
-            check_order(order, self.action_size)
+            check_count("order", order)
+            check_memory(8 * ((order + 1) * self.action_size) ** 2, order=order)
         self.order = order
 
     @property
@@ -70,10 +70,7 @@ class AutoregressivePrior(LinearGaussianPrior):
         orders = self.orders if self.order is None else (self.order,)
         longest = int(plans.mask().sum(1).max())
         if self.order and self.order >= longest:
-            raise ValueError(
-                f"order: {self.order} vectors before each are read, and the longest plan has {longest}; a lower one is"
-                " expected"
-            )
+            raise ValueError(f"`order` must be below the length of the longest plan, {longest}, got {self.order}")
         parts = self._parts(plans, generator)
         total = sum(int(held_out.mask()[:, skip:].sum()) for _, held_out, skip in parts)
         scores: dict[tuple[int, float, float], float] = {}
@@ -82,7 +79,7 @@ class AutoregressivePrior(LinearGaussianPrior):
             fewest = min(int((learning.mask().sum(1) - order).clamp(min=0).sum()) for learning, *_ in parts)
             if order > 1 and scores and fewest <= numbers:
                 break
-            few = self.action_size > 1 and fewest < MANY * numbers
+            few = self.action_size > 1 and fewest < ENOUGH_WINDOWS * numbers
             tried = list(product(SHARES if few else SHARES[-1:], RIDGES))
             scores |= {(order, *each): 0.0 for each in tried}
             for learning, held_out, skip in parts:
@@ -90,7 +87,7 @@ class AutoregressivePrior(LinearGaussianPrior):
                 found = self.mean_nats_of(tried, self._moments(learning, order), held_out, skip)
                 for each, nats in found.items():
                     scores[order, *each] += weight * nats
-        order, share, ridge = best_of(scores)
+        order, share, ridge = max(scores, key=scores.__getitem__)  # of equals the first
         self.set_window(self._moments(plans, order)((share, ridge)))
 
     def _moments(self, plans: VectorPlans, order: int) -> Callable[[tuple[float, float]], WindowMoments]:
@@ -112,12 +109,12 @@ class AutoregressivePrior(LinearGaussianPrior):
             group = plans.group.unique(return_inverse=True)[1]
             if 2 * int(group.bincount(lengths).max()) > total:
                 plans = ungrouped(plans)
-        if total < 2 or total > MOST_IN_FOLDS:
+        if total < 2 or total > MAX_VECTORS_IN_FOLDS:
             return [(*held_out_split(plans, generator), 0)]
         if 2 * longest > total:
-            at = [round(longest * k / FOLDS) for k in range(FOLDS + 1)]
+            at = [round(longest * k / NUM_FOLDS) for k in range(NUM_FOLDS + 1)]
             return [self._without(ungrouped(plans), *each) for each in pairwise(at) if each[0] < each[1]]
-        found = folds(plans, min(num_units(plans), FOLDS), draw_seed(generator))
+        found = folds(plans, min(num_units(plans), NUM_FOLDS), draw_seed(generator))
         return [(plans[learned], plans[left_out], 0) for learned, left_out in found]
 
     def _without(self, plans: VectorPlans, first: int, end: int) -> tuple[VectorPlans, VectorPlans, int]:

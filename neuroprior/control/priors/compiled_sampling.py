@@ -1,4 +1,4 @@
-"""Compiled loops that draw plans of vectors, for `LinearGaussianPrior` and `VectorGRU`; importing this loads numba."""
+"""Compiled loops that draw plans of vectors on a CPU, for `LinearGaussianPrior` and `VectorGRU`."""
 
 from typing import Any
 
@@ -6,22 +6,15 @@ import numpy as np
 from numba import njit
 from torch import Tensor
 
-from neuroprior.priors.neural.compiled_gru import sigmoid, tanh
+from neuroprior.priors.neural.compiled_gru import BLOCK, Network, advance
 
 Array = np.ndarray[Any, Any]
 
 
 def draw_linear(prior: Any, vectors: Tensor, known: int, noise: Tensor) -> None:
-    """As `neuroprior.control.priors.linear_gaussian.draw_linear`, of float32 on the CPU."""
+    """Fill in `vectors [N, known + L, D]`, scaled, behind the first `known`, by standard normal `noise [N, L, D]`."""
     weights, offset, std, coupling = (each.numpy() for each in (prior.weights, prior.offset, prior.std, prior.coupling))
     _linear(vectors.numpy(), known, prior.memory, weights, offset, std, coupling, noise.numpy())
-
-
-@njit(nogil=True, cache=True)
-def _copy(into: Array, row: Array) -> None:
-    """`into[:] = row`, which takes seconds to compile."""
-    for k in range(len(into)):
-        into[k] = row[k]
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
@@ -41,7 +34,8 @@ def _linear(
         plan = vectors[n]
         for t in range(known, len(plan)):
             h = min(t, depth)
-            _copy(mean, offset[h])
+            for d in range(size):
+                mean[d] = offset[h, d]
             for back in range(h):
                 row = (depth - h + back) * size
                 for j in range(size):
@@ -55,108 +49,56 @@ def _linear(
                 plan[t, d] = min(max(centre, np.float32(-1)), np.float32(1))
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def _gated(into: Array, from_own: Array, state: Array) -> None:
-    """Move on the `state` of a layer, by what its input and its own state give to the gates."""
-    width = len(state)
-    for k in range(width):
-        reset = sigmoid(into[k] + from_own[k])
-        update = sigmoid(into[width + k] + from_own[width + k])
-        fresh = tanh(into[2 * width + k] + reset * from_own[2 * width + k])
-        state[k] = fresh + update * (state[k] - fresh)
-
-
-def draw_recurrent(prior: Any, least_std: float, inputs: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
-    """As `VectorNetwork.draw`, for a `VectorGRU` of float32 on the CPU; `least_std` in units of half the range."""
+def draw_recurrent(prior: Any, min_std: float, past: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
+    """As `VectorGRU.draw`; `min_std` in units of half the range."""
     # numpy throughout: for these sizes a call of torch takes longer than what it computes.
     layers = [[each.detach().numpy() for each in layer] for layer in prior.gru.all_weights]
-    inputs_weight, inputs_bias, head, head_bias, direct = (
-        each.detach().numpy()
-        for each in (prior.inputs.weight, prior.inputs.bias, prior.head.weight, prior.head.bias, prior.linear.weight)
+    into, own, into_bias, own_bias = (np.stack([layer[i] for layer in layers]) for i in range(4))
+    width = prior.width
+    biases = into_bias.copy()
+    biases[:, : 2 * width] += own_bias[:, : 2 * width]
+    unused = np.empty((0, 3 * width), np.float32)
+    network = Network(
+        action=unused,
+        past=unused[None],
+        beyond=unused,
+        recurrent=np.ascontiguousarray(own.transpose(0, 2, 1)),
+        bias=np.ascontiguousarray(own_bias[:, 2 * width :]),
+        above=np.ascontiguousarray(into[1:].transpose(0, 2, 1)),
+        above_bias=biases[1:],
+        head=np.ascontiguousarray(prior.head.weight.detach().numpy().T),
+        head_bias=prior.head.bias.detach().numpy(),
     )
-    bounds = np.stack([each.numpy() for each in (prior.middle, prior.half_range, prior.action_low, prior.action_high)])
     # What the first layer is given is linear in the inputs: two matrices in one.
-    given = inputs_weight.T @ layers[0][0].T
-    given_bias = layers[0][0] @ inputs_bias + layers[0][2]
-    # Gates of higher layers are given what the layer below has found; the first layer's place is not read.
-    above, own, above_bias, own_bias = (np.array([layer[i].T for layer in layers], order="C") for i in range(4))
-    size = prior.action_size
-    coupling, relative = np.zeros((size, size), np.float32), bounds[1][:, None] / bounds[1]
-    if prior.coupling is not None:
-        coupling = np.tril(prior.coupling.detach().numpy(), -1) * relative
-    first_log_std = prior.first_log_std.detach().numpy()
-    linear = prior.autoregression
-    linear_coupling = linear.coupling.numpy() * relative
-    share = prior.autoregressive_share
+    given = prior.inputs.weight.detach().numpy().T @ into[0].T
+    given_bias = into[0] @ prior.inputs.bias.detach().numpy() + biases[0]
+    inputs, skip = past.contiguous().numpy(), past.shape[2] - len(given)
+    gates = inputs[:, :, skip:] @ given + given_bias
+    linear, share = prior.autoregression, prior.autoregressive_share
+    bounds = np.stack([each.numpy() for each in (prior.middle, prior.half_range, prior.action_low, prior.action_high)])
     vectors = noise.new_empty(noise.shape)
     _recurrent(
+        network,
         vectors.numpy(),
-        inputs.contiguous().numpy(),
+        inputs[:, -1],
+        np.ascontiguousarray(gates),
         uniform.numpy(),
         noise.numpy(),
-        above,
-        above_bias,
-        own,
-        own_bias,
         given,
         given_bias,
-        head,
-        head_bias,
-        direct,
-        first_log_std,
-        coupling,
+        prior.linear.weight.detach().numpy(),
+        prior.first_log_std.detach().numpy(),
         linear.weights.numpy(),
         linear.offset.numpy(),
         linear.std.numpy(),
-        linear_coupling,
+        linear.coupling.numpy() * (bounds[1][:, None] / bounds[1]),
         np.float32(share / (1 - share)),
         bounds,
         prior.num_components,
         prior.recent_size,
-        np.float32(least_std),
+        np.float32(min_std),
     )
     return vectors
-
-
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def _add_product(total: Array, vector: Array, matrix: Array) -> None:
-    """Add `vector @ matrix`, four rows at a time."""
-    whole = len(vector) // 4 * 4
-    for k in range(0, whole, 4):
-        v0, v1, v2, v3 = vector[k], vector[k + 1], vector[k + 2], vector[k + 3]
-        for j in range(len(total)):
-            total[j] += v0 * matrix[k, j] + v1 * matrix[k + 1, j] + v2 * matrix[k + 2, j] + v3 * matrix[k + 3, j]
-    for k in range(whole, len(vector)):
-        value = vector[k]
-        for j in range(len(total)):
-            total[j] += value * matrix[k, j]
-
-
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def _advance(
-    hidden: Array,
-    inputs: Array,
-    given: Array,
-    given_bias: Array,
-    own: Array,
-    own_bias: Array,
-    above: Array,
-    above_bias: Array,
-    into: Array,
-    from_own: Array,
-) -> None:
-    """Move on the hidden states `[num_layers, width]` by `inputs [E]`; `into` and `from_own` are room."""
-    for layer in range(len(hidden)):
-        before = hidden[layer]
-        _copy(from_own, own_bias[layer])
-        _add_product(from_own, before, own[layer])
-        if layer:
-            _copy(into, above_bias[layer])
-            _add_product(into, hidden[layer - 1], above[layer])
-        else:
-            _copy(into, given_bias)
-            _add_product(into, inputs, given)
-        _gated(into, from_own, before)
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
@@ -169,21 +111,16 @@ def _dot(start: Any, one: Array, other: Array) -> Any:
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 def _recurrent(
+    network: Network,
     vectors: Array,
-    past: Array,
+    last: Array,
+    past_gates: Array,
     uniform: Array,
     noise: Array,
-    above: Array,
-    above_bias: Array,
-    own: Array,
-    own_bias: Array,
     given: Array,
     given_bias: Array,
-    head: Array,
-    head_bias: Array,
     direct: Array,
     first_log_std: Array,
-    coupling: Array,
     linear_weights: Array,
     linear_offset: Array,
     linear_std: Array,
@@ -192,82 +129,98 @@ def _recurrent(
     bounds: Array,
     num: int,
     recent: int,
-    least_std: Any,
+    min_std: Any,
 ) -> None:
-    """`past [B, T, E]` begins with `recent` numbers of last vectors; `bounds`: centre, half the range, low, high.
+    """Read B pasts, and draw N / B plans after each, in blocks that stay in the cache.
 
-    Of the inputs the network reads the last ones, as many as `given` has rows.
-    `odds`: of the autoregression, against the network's components together.
+    Args:
+        network: the recurrent layers and the head; the rest of it is not used.
+        vectors: `[N, L, D]`, which are written.
+        last: `[B, E]`: the last input of each past, of which the first `recent` numbers are last vectors.
+        past_gates: `[B, T, 3 H]`: what the inputs of the past add to the gates of the first layer, biases included.
+        uniform: `[N, L]`, which choose the components, and standard normal `noise [N, L, D]`.
+        given: `[E', 3 H]`: what the last E' numbers of an input add to these gates, and `given_bias [3 H]`.
+        direct: `[D, E]`: what an input adds to the means.
+        first_log_std: `[D]`.
+        linear_weights, linear_offset, linear_std, linear_coupling: the autoregression, see `Autoregression`.
+        odds: of the autoregression, against the network's components together.
+        bounds: `[4, D]`: centre, half the range, low, high.
+        num: the network's components.
+        recent: see `last`.
+        min_std: the least standard deviation.
     """
-    length, size = vectors.shape[1], vectors.shape[2]
-    num_layers, width, entry, one = own.shape[0], own.shape[1], size + 1, np.float32(1)
-    into, from_own = np.empty(3 * width, np.float32), np.empty(3 * width, np.float32)
-    known, hidden = np.empty((num_layers, width), np.float32), np.empty((num_layers, width), np.float32)
-    inputs = np.empty(past.shape[2], np.float32)
-    each, skip = len(vectors) // max(len(past), 1), past.shape[2] - len(given)
+    length, size, entry, one = vectors.shape[1], vectors.shape[2], vectors.shape[2] + 1, np.float32(1)
+    batch, outputs, skip = len(last), len(network.head_bias), last.shape[1] - len(given)
+    num_layers, width = network.recurrent.shape[:2]
+    each = len(vectors) // max(batch, 1)
+    known, first = np.empty((batch, num_layers, width), np.float32), np.empty((batch, outputs), np.float32)
+    states, logits = np.zeros((num_layers, BLOCK, width), np.float32), np.empty((BLOCK, outputs), np.float32)
+    gates, product = np.empty((BLOCK, 3 * width), np.float32), np.empty((BLOCK, 3 * width), np.float32)
+    inputs, read = np.empty((BLOCK, last.shape[1]), np.float32), np.empty((BLOCK, len(given)), np.float32)
     weights, mean = np.empty(num + 1, np.float32), np.empty(size, np.float32)
-    last = num if odds > 0 else num - 1
+    final = num if odds > 0 else num - 1
     centre, half, low, high = bounds[0], bounds[1], bounds[2], bounds[3]
-    for n in range(len(vectors)):
-        if n % each == 0:
-            known[:] = 0
-            for t in range(past.shape[1]):
-                _advance(
-                    known,
-                    past[n // each, t, skip:],
-                    given,
-                    given_bias,
-                    own,
-                    own_bias,
-                    above,
-                    above_bias,
-                    into,
-                    from_own,
-                )
-        for layer in range(num_layers):
-            _copy(hidden[layer], known[layer])
-        _copy(inputs, past[n // each, past.shape[1] - 1])
-        top = hidden[num_layers - 1]
+    for begin in range(0, batch, BLOCK):
+        rows = min(BLOCK, batch - begin)
+        states[:] = 0
+        for t in range(past_gates.shape[1]):
+            gates[:rows] = past_gates[begin : begin + rows, t]
+            advance(network, rows, states, gates, product, logits)
+        for i in range(rows):
+            first[begin + i] = logits[i]
+            known[begin + i] = states[:, i]
+    for begin in range(0, len(vectors), BLOCK):
+        rows = min(BLOCK, len(vectors) - begin)
+        for i in range(rows):
+            start = (begin + i) // each
+            inputs[i] = last[start]
+            logits[i] = first[start]
+            states[:, i] = known[start]
         for t in range(length):
             if t:
-                for j in range(recent - entry):
-                    inputs[j] = inputs[j + entry]
+                for i in range(rows):
+                    for j in range(recent - entry):
+                        inputs[i, j] = inputs[i, j + entry]
+                    for d in range(size):
+                        inputs[i, recent - entry + d] = (vectors[begin + i, t - 1, d] - centre[d]) / half[d]
+                    inputs[i, recent - 1] = one
+                    for j in range(len(given)):
+                        read[i, j] = inputs[i, skip + j]
+                np.dot(read[:rows], given, gates[:rows])
+                for i in range(rows):
+                    for j in range(3 * width):
+                        gates[i, j] += given_bias[j]
+                advance(network, rows, states, gates, product, logits)
+            for i in range(rows):
+                n = begin + i
+                highest, total = np.float32(-np.inf), np.float32(0)
+                for c in range(num):
+                    highest = max(highest, logits[i, c])
+                for c in range(num):
+                    weights[c] = np.exp(logits[i, c] - highest)
+                    total += weights[c]
+                weights[num] = total * odds
+                total += weights[num]
+                chosen, so_far = 0, weights[0]
+                while chosen < final and uniform[n, t] * total > so_far:
+                    chosen += 1
+                    so_far += weights[chosen]
+                if chosen == num:
+                    h = 0
+                    for j in range(entry - 1, recent, entry):
+                        h += int(inputs[i, j])
+                    for d in range(size):
+                        value = _dot(linear_offset[h, d], linear_weights[h, d], inputs[i, :recent])
+                        mean[d] = centre[d] + half[d] * value
+                        value = mean[d] + half[d] * linear_std[h, d] * noise[n, t, d]
+                        for j in range(d):
+                            value += linear_coupling[h, d, j] * (vectors[n, t, j] - mean[j])
+                        vectors[n, t, d] = min(max(value, low[d]), high[d])
+                    continue
                 for d in range(size):
-                    inputs[recent - entry + d] = (vectors[n, t - 1, d] - centre[d]) / half[d]
-                inputs[recent - 1] = one
-                _advance(hidden, inputs[skip:], given, given_bias, own, own_bias, above, above_bias, into, from_own)
-            highest, total = np.float32(-np.inf), np.float32(0)
-            for c in range(num):
-                weights[c] = _dot(head_bias[c], head[c], top)
-                highest = max(highest, weights[c])
-            for c in range(num):
-                weights[c] = np.exp(weights[c] - highest)
-                total += weights[c]
-            weights[num] = total * odds
-            total += weights[num]
-            chosen, so_far = 0, weights[0]
-            while chosen < last and uniform[n, t] * total > so_far:
-                chosen += 1
-                so_far += weights[chosen]
-            if chosen == num:
-                h = 0
-                for j in range(entry - 1, recent, entry):
-                    h += int(inputs[j])
-                for d in range(size):
-                    mean[d] = centre[d] + half[d] * _dot(linear_offset[h, d], linear_weights[h, d], inputs[:recent])
-                    value = mean[d] + half[d] * linear_std[h, d] * noise[n, t, d]
-                    for j in range(d):
-                        value += linear_coupling[h, d, j] * (vectors[n, t, j] - mean[j])
+                    column = num + chosen * size + d
+                    value = centre[d] + half[d] * _dot(logits[i, column], direct[d], inputs[i])
+                    log_std = logits[i, column + num * size] + (one - inputs[i, recent - 1]) * first_log_std[d]
+                    std = np.exp(min(max(log_std, np.float32(-9)), np.float32(3))) + min_std
+                    value += half[d] * std * noise[n, t, d]
                     vectors[n, t, d] = min(max(value, low[d]), high[d])
-                continue
-            for d in range(size):
-                row = num + chosen * size + d
-                value = _dot(_dot(head_bias[row], head[row], top), direct[d], inputs)
-                mean[d] = centre[d] + half[d] * value
-                row += num * size
-                log_std = _dot(head_bias[row], head[row], top) + (one - inputs[recent - 1]) * first_log_std[d]
-                std = np.exp(min(max(log_std, np.float32(-9)), np.float32(3))) + least_std
-                value = mean[d] + half[d] * std * noise[n, t, d]
-                for j in range(d):
-                    value += coupling[d, j] * (vectors[n, t, j] - mean[j])
-                vectors[n, t, d] = min(max(value, low[d]), high[d])

@@ -1,8 +1,7 @@
 """What priors share whose next vector is Gaussian and linear in the last ones: closed forms, and moments of windows."""
 
-import sys
 from abc import abstractmethod
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from math import log, pi
 from typing import Any, NamedTuple, Self, TypeVar
 
@@ -10,18 +9,18 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from neuroprior._checks import check_count, check_memory
-from neuroprior._compiled import compiled
+from neuroprior._checks import check_count
 from neuroprior._random import generator_on
+from neuroprior.control.priors.compiled_sampling import draw_linear
 from neuroprior.control.priors.vector_prior import GaussianForecast, VectorPrior, censored_log_prob
 from neuroprior.control.vector_plans import VectorPlans
 from neuroprior.plans.folds import divisible, fair_split
 from neuroprior.plans.sequences import check_validation
 
-LEAST_STD = 1e-3
-"""Of half a dimension's range: the standard deviations of priors are at least so large, see `least_std`."""
+MIN_STD = 1e-3
+"""Of half a dimension's range: the standard deviations of priors are at least so large, see `min_std`."""
 
-LEAST_SHARE, ROUNDING = 1e-2, 2.0**-24
+MIN_STD_SHARE, ROUNDING = 1e-2, 2.0**-24
 """The share of the standard deviation of the vectors that is enough where bounds are wide; and the error of single
 precision, as a share of a number.
 """
@@ -29,11 +28,11 @@ precision, as a share of a number.
 HELD_OUT = 0.2
 """Share of the plans (or groups) on which settings are chosen."""
 
-FEW_AT_BOUNDS, CENSORED_STEPS, CENSORED_CHANGE = 0.005, 50, 1e-4
+MAX_UNCENSORED_SHARE, EM_STEPS, EM_CHANGE = 0.005, 50, 1e-4
 """The share of vectors at the bounds of a dimension up to which they count as they are; for more, the most steps of EM,
 and the change of a vector with which it ends."""
 
-LARGEST = 2**21
+MAX_NUMBERS_AT_ONCE = 2**21
 """Numbers of the covariances, and of the predictions, of several settings that are computed together."""
 
 Key = TypeVar("Key", bound=Hashable)
@@ -127,7 +126,7 @@ class LinearGaussianPrior(VectorPrior):
         rest = list(settings)
         while rest:
             first = moments(rest[0])
-            at_once = max(LARGEST // max(first.mean.numel() ** 2, values.numel()), 1)
+            at_once = max(MAX_NUMBERS_AT_ONCE // max(first.mean.numel() ** 2, values.numel()), 1)
             some, rest = rest[:at_once], rest[at_once:]
             tables = predictions([first, *map(moments, some[1:])], self)
             nats = linear_nats(tables, values, self.half_range).masked_fill(~mask, 0)
@@ -148,31 +147,26 @@ class LinearGaussianPrior(VectorPrior):
         return self.memory
 
     def _forecast(self, state: Tensor) -> tuple[GaussianForecast, Tensor]:
-        mean = self._means(self.scaled(state), state.shape[1])
         half, h = self.half_range, state.shape[1]
+        start = (self._depth - h) * self.action_size
+        mean = self.scaled(state).flatten(1) @ self.weights[h, start:] + self.offset[h]
         coupling = half[:, None] * self.coupling[h] / half
         forecast = GaussianForecast(
             (self.middle + half * mean)[:, None], half * self.std[h], self.action_low, self.action_high, None, coupling
         )
         return forecast, state
 
-    def _means(self, history: Tensor, h: int) -> Tensor:
-        """Means `[..., D]`, scaled, after `history [..., h, D]`."""
-        start = (self._depth - h) * self.action_size
-        means: Tensor = history.flatten(-2) @ self.weights[h, start:] + self.offset[h]
-        return means
-
     def continuations(
         self, num_plans: int, length: int, past: Tensor, context: Tensor | None, generator: torch.Generator
     ) -> Tensor:
+        if self.device.type != "cpu":
+            return super().continuations(num_plans, length, past, context, generator)
         depth, size, batch = self._depth, self.action_size, len(past)
         known = min(past.shape[1], depth)
-        vectors = torch.empty(batch * num_plans, known + length, size, device=self.device)
+        vectors = torch.empty(batch * num_plans, known + length, size)
         vectors[:, :known] = self.scaled(past[:, past.shape[1] - known :]).repeat_interleave(num_plans, 0)
-        noise = torch.randn(batch * num_plans, length, size, generator=generator, device=self.device)
-        able = vectors.device.type == "cpu" and vectors.dtype == self.weights.dtype == torch.float32
-        fast = compiled("neuroprior.control.priors.compiled_sampling") if able else None
-        (fast or sys.modules[__name__]).draw_linear(self, vectors, known, noise)
+        noise = torch.randn(batch * num_plans, length, size, generator=generator)
+        draw_linear(self, vectors, known, noise)
         return self.unscaled(vectors[:, known:]).view(batch, num_plans, length, size)
 
     def action_log_probs(self, plans: VectorPlans) -> Tensor:
@@ -181,8 +175,7 @@ class LinearGaussianPrior(VectorPrior):
         tables = LinearTables(self.weights[None], self.offset[None], self.std[None], self.coupling[None])
         return linear_nats(tables, self.scaled(plans.actions), self.half_range)[0].masked_fill(~plans.mask(), 0)
 
-    def fit(self, plans: VectorPlans, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
-        self.check_settings(settings)
+    def fit(self, plans: VectorPlans, *, generator: torch.Generator | None = None) -> Self:
         plans = self.training_plans(plans)
         self.learn(plans, generator_on(generator, "cpu"))
         return self
@@ -190,22 +183,6 @@ class LinearGaussianPrior(VectorPrior):
     @abstractmethod
     def learn(self, plans: VectorPlans, generator: torch.Generator) -> None:
         """Fit to plans with at least one vector; choices are made on held-out plans that `generator` draws."""
-
-
-def draw_linear(prior: LinearGaussianPrior, vectors: Tensor, known: int, noise: Tensor) -> None:
-    """Fill in `vectors [N, known + L, D]`, scaled, behind the first `known`, by standard normal `noise [N, L, D]`."""
-    depth, coupled = prior.memory or 0, bool(prior.coupling.any())
-    for t in range(known, vectors.shape[1]):
-        h = min(t, depth)
-        mean = prior._means(vectors[:, t - h : t], h)
-        free, coupling = mean + noise[:, t - known] * prior.std[h], prior.coupling[h]
-        if not coupled:
-            vectors[:, t] = free.clamp(-1, 1)
-            continue
-        now = vectors[:, t]
-        now[:, 0] = free[:, 0].clamp(-1, 1)
-        for d in range(1, vectors.shape[2]):
-            now[:, d] = (free[:, d] + (now[:, :d] - mean[:, :d]) @ coupling[d, :d]).clamp(-1, 1)
 
 
 def rounding(prior: VectorPrior, mean: Tensor) -> Tensor:
@@ -218,18 +195,18 @@ def is_constant(std: Tensor, error: Tensor) -> Tensor:
     return std <= 2 * error
 
 
-def least_std(std: Tensor, error: Tensor) -> Tensor:
+def min_std(std: Tensor, error: Tensor) -> Tensor:
     """The least standard deviations of predictions, in units of half the range, as all here.
 
-    Without them predictions could be infinitely likely. Where bounds are wide, `LEAST_STD` is more than the vectors
-    vary by, so that a share of what they vary by is taken. Constant dimensions have `LEAST_STD`.
+    Without them predictions could be infinitely likely. Where bounds are wide, `MIN_STD` is more than the vectors
+    vary by, so that a share of what they vary by is taken. Constant dimensions have `MIN_STD`.
 
     Args:
         std: of the vectors.
         error: of their rounding.
     """
-    share = (LEAST_SHARE * std).maximum(error)
-    return share.masked_fill(is_constant(std, error), torch.inf).clamp(max=LEAST_STD)
+    share = (MIN_STD_SHARE * std).maximum(error)
+    return share.masked_fill(is_constant(std, error), torch.inf).clamp(max=MIN_STD)
 
 
 def predictions(moments: Sequence[WindowMoments], prior: VectorPrior) -> LinearTables:
@@ -256,7 +233,7 @@ def _predictions(mean: Tensor, covariance: Tensor, ridge: Tensor, error: Tensor)
     memory = mean.shape[1] // size - 1
     last, eye = slice(memory * size, None), torch.eye(size, dtype=torch.double, device=mean.device)
     spread = covariance[:, last, last].diagonal(dim1=1, dim2=2).clamp(min=0).sqrt()
-    least = least_std(spread, error).square()
+    least = min_std(spread, error).square()
     rows = []
     for h in range(memory + 1):
         past = slice((memory - h) * size, memory * size)
@@ -322,12 +299,6 @@ def linear_nats(tables: LinearTables, values: Tensor, half_range: Tensor) -> Ten
     return nats
 
 
-def check_order(order: int, action_size: int) -> None:
-    """Raise ValueError unless vectors can depend on so many before them, in the memory of this machine."""
-    check_count("order", order)
-    check_memory(8 * ((order + 1) * action_size) ** 2, order=order)
-
-
 def held_out_split(
     plans: VectorPlans, generator: torch.Generator, share: float = HELD_OUT
 ) -> tuple[VectorPlans, VectorPlans]:
@@ -339,18 +310,6 @@ def held_out_split(
     check_validation(share)
     plans = divisible(plans[plans.mask().any(1)])
     return fair_split(plans, share, generator, divide_groups=True) if int(plans.mask().sum()) > 1 else (plans, plans)
-
-
-@torch.no_grad()
-def mean_nats(prior: VectorPrior, plans: VectorPlans) -> float:
-    """The mean log-density of a vector of `plans`, nats; -inf where it is not a number."""
-    total = float(prior.action_log_probs(plans).double().sum() / plans.mask().sum().clamp(min=1))
-    return total if total == total else float("-inf")
-
-
-def best_of(scores: Mapping[Key, float]) -> Key:
-    """The key with the highest score; of equals the first."""
-    return max(scores, key=lambda each: scores[each])
 
 
 def window_moments(windows: Tensor) -> WindowMoments:
@@ -375,21 +334,21 @@ def beyond_bounds(windows: Tensor) -> tuple[Tensor, Tensor]:
     given, last = windows[:, :-1].flatten(1).double(), windows[:, -1].double()
     at, side = last.abs() >= 1, last.sign()
     variance = torch.zeros_like(last)
-    if float(at.double().mean(0).max()) < FEW_AT_BOUNDS:
+    if float(at.double().mean(0).max()) < MAX_UNCENSORED_SHARE:
         return last, variance[0] * 0
     given = given - given.mean(0)
     known = given.T @ given / len(given)
     known.diagonal().add_(known.diagonal().mean().nan_to_num() * 1e-3 + 1e-9)
     solved, value = torch.linalg.solve(known, given.T) / len(given), last
-    for _ in range(CENSORED_STEPS):
+    for _ in range(EM_STEPS):
         before, middle = value, value.mean(0)
         mean = middle + given @ (solved @ (value - middle))
-        std = ((value - mean).square() + variance).mean(0).sqrt().clamp(min=LEAST_STD)
+        std = ((value - mean).square() + variance).mean(0).sqrt().clamp(min=MIN_STD)
         away = (1 - side * mean) / std
         rate = (-away.square() / 2 - torch.special.log_ndtr(-away) - log(2 * pi) / 2).exp()
         value = torch.where(at, mean + side * std * rate, last)
         variance = torch.where(at, std.square() * (1 + away * rate - rate.square()).clamp(min=0), 0.0)
-        if float((value - before).abs().max()) < CENSORED_CHANGE:
+        if float((value - before).abs().max()) < EM_CHANGE:
             break
     return value, variance.mean(0)
 

@@ -10,12 +10,12 @@ from neuroprior._checks import check_count
 from neuroprior.control.priors.linear_gaussian import (
     LinearGaussianPrior,
     WindowMoments,
-    best_of,
     is_constant,
     rounding,
     window_moments,
 )
 from neuroprior.control.vector_plans import VectorPlans
+from neuroprior.control.worlds.continuous_world import check_positive
 
 
 class NoisePrior(LinearGaussianPrior):
@@ -41,7 +41,7 @@ class NoisePrior(LinearGaussianPrior):
     """
 
     exponents = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
-    """Those that `fit` tries."""
+    """Those that `fit` tries; the first is white noise."""
 
     def __init__(
         self,
@@ -53,11 +53,10 @@ class NoisePrior(LinearGaussianPrior):
     ) -> None:
         super().__init__(action_low, action_high)
         check_count("memory", memory)
-        for name, value in (("exponent", exponent), ("scale", scale)):
-            real = isinstance(value, int | float) and not isinstance(value, bool)
-            least = "of at least 0" if name == "exponent" else "above 0"
-            if value is not None and not (real and 0 <= value < float("inf") and (value or name == "exponent")):
-                raise ValueError(f"{name}: a number {least} is expected, not {value!r}")
+        if exponent is not None:
+            check_positive(zero=True, exponent=exponent)
+        if scale is not None:
+            check_positive(scale=scale)
         self._given = {"exponent": exponent, "scale": scale, "memory": memory}
         self.exponent = exponent or 0.0
         start = torch.zeros(self.action_size), torch.full((self.action_size,), scale or 1.0)
@@ -94,9 +93,8 @@ class NoisePrior(LinearGaussianPrior):
             mean, std = torch.zeros_like(mean), torch.full_like(std, self._given["scale"])
         moments = partial(self._moments, mean, std)
         if self._given["exponent"] is None:
-            coloured = [each for each in self.exponents if each]  # windows of `memory` + 1 vectors, white ones of 1
-            white = [each for each in self.exponents if not each]
-            self.exponent = best_of(
-                self.mean_nats_of(white, moments, plans) | self.mean_nats_of(coloured, moments, plans)
-            )
+            # Windows of `memory` + 1 vectors for coloured noise, of 1 for white.
+            white, coloured = self.exponents[:1], self.exponents[1:]
+            nats = self.mean_nats_of(white, moments, plans) | self.mean_nats_of(coloured, moments, plans)
+            self.exponent = max(nats, key=nats.__getitem__)
         self.set_window(moments(self.exponent))

@@ -1,15 +1,14 @@
 """Stored windows: a plan continues as the stored plans did whose past was nearest to its own."""
 
-from collections.abc import Mapping
 from itertools import product
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 from neuroprior._checks import check_count, check_memory, check_sizes
 from neuroprior._random import generator_on
-from neuroprior.control.priors.linear_gaussian import best_of, held_out_split, least_std, mean_nats, rounding
+from neuroprior.control.priors.linear_gaussian import held_out_split, min_std, rounding
 from neuroprior.control.priors.vector_prior import GaussianForecast, VectorPrior, censored_log_prob
 from neuroprior.control.vector_plans import VectorPlans
 
@@ -20,19 +19,19 @@ range."""
 NOISES = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4)
 """Standard deviations around the stored vectors that `fit` tries."""
 
-ORDINARY, FINE = 0.02, 0.08
-"""The least noise that is tried; a lesser one only where it is `FINE` standard deviations of the vectors or more. The
-least bandwidth is 2.5 times as large."""
+MAX_LEAST_NOISE, FINE_NOISE = 0.02, 0.08
+"""The least noise that is tried; a lesser one only where it is `FINE_NOISE` standard deviations of the vectors or more.
+The least bandwidth is 2.5 times as large."""
 
 BANDWIDTH, NOISE = 0.2, 0.1
 """The bandwidth and the noise before `fit`, and where no plans can be held out to choose them on."""
 
-EXTENT = 32
+MAX_EXTENT_STDS = 32
 """Distances are in units of half the range, or of so many standard deviations of the stored vectors if that is less:
 what is tried would be too coarse for vectors that take up a small part of the range.
 """
 
-MOST_CHOSEN_WITH, MOST_CHOSEN_ON = 1_000, 500
+MAX_WINDOWS_CHOSEN_WITH, MAX_VECTORS_CHOSEN_ON = 1_000, 500
 """The most stored windows with which, and the most held-out vectors on which, bandwidths are chosen; in the end all
 windows are stored.
 """
@@ -47,8 +46,7 @@ class StoredWindows(VectorPrior):
     which segment is being followed is not known, a vector's density is that of a mixture, weighted by how well each
     segment predicted the vectors since it began. Distances are in units of half the range, or of 32 standard
     deviations of the stored vectors where that is less; in the same units in all dimensions, or in proportion to the
-    standard deviation of each, if that predicts held-out plans better; where bandwidth and noise are given, in the
-    same.
+    standard deviation of each, if that predicts held-out plans better.
 
     `read` begins a new segment after the past. `state` is `[N, 2 + match * D + M]`: vectors known, place in the
     segment, the last vectors, and the log-weights of M stored segments.
@@ -57,8 +55,6 @@ class StoredWindows(VectorPrior):
         action_low, action_high: D numbers each: the bounds.
         match: vectors of the past that are compared.
         horizon: vectors of a segment.
-        bandwidth: of the match; None: the one that predicts held-out plans best.
-        noise: standard deviation around the stored vectors, in these units; None: chosen in the same way.
         max_windows: segments that are stored at most; of more, as many evenly spaced ones.
 
     Raises:
@@ -72,13 +68,12 @@ class StoredWindows(VectorPrior):
         torch.Size([1, 3, 20, 1])
     """
 
-    later: ClassVar[Mapping[str, float]] = {"extent": 1.0}
     tables = ("extent",)
 
     segments: Tensor
 
     extent: Tensor
-    """`[D]`, or `[]` in files of earlier versions: the units of distances as shares of half the range."""
+    """`[D]`: the units of distances as shares of half the range."""
 
     def __init__(
         self,
@@ -86,20 +81,13 @@ class StoredWindows(VectorPrior):
         action_high: Any,
         match: int = 4,
         horizon: int = 20,
-        bandwidth: float | None = None,
-        noise: float | None = None,
         max_windows: int = 10_000,
     ) -> None:
         super().__init__(action_low, action_high)
         check_sizes(horizon=horizon, max_windows=max_windows)
         check_count("match", match)
-        for name, value in (("bandwidth", bandwidth), ("noise", noise)):
-            real = isinstance(value, int | float) and not isinstance(value, bool)
-            if value is not None and not (real and 0 < value < float("inf")):
-                raise ValueError(f"{name}: a number above 0 is expected, not {value!r}")
         self.match, self.horizon, self.max_windows = match, horizon, max_windows
-        self._given = {"bandwidth": bandwidth, "noise": noise}
-        self.bandwidth, self.noise = bandwidth or BANDWIDTH, noise or NOISE
+        self.bandwidth, self.noise = BANDWIDTH, NOISE
         self.memory = match
         # Before anything is learned, one segment in the middle of the range.
         self.register_buffer("segments", torch.zeros(1, match + horizon, self.action_size))
@@ -108,7 +96,7 @@ class StoredWindows(VectorPrior):
     @property
     def config(self) -> dict[str, Any]:
         own = {"match": self.match, "horizon": self.horizon, "max_windows": self.max_windows}
-        return super().config | own | self._given
+        return super().config | own
 
     @property
     def learned(self) -> dict[str, Any]:
@@ -123,50 +111,50 @@ class StoredWindows(VectorPrior):
         check_memory(4 * shape[0] * shape[1] * shape[2], num_segments=number)
         self.bandwidth, self.noise = float(learned["bandwidth"]), float(learned["noise"])
         if not (0 < self.bandwidth < float("inf") and 0 < self.noise < float("inf")):
-            raise ValueError(f"bandwidth, noise: numbers above 0 are expected, not {self.bandwidth}, {self.noise}")
+            raise ValueError(f"`bandwidth` and `noise` must be above 0, got {self.bandwidth} and {self.noise}")
         self.register_buffer("segments", torch.zeros(shape, device=self.device))
 
     def tables_fit(self) -> bool:
-        return self.extent.shape in ((), (self.action_size,)) and bool((self.extent > 0).all())
+        return self.extent.shape == (self.action_size,) and bool((self.extent > 0).all())
 
-    def fit(self, plans: VectorPlans, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
-        self.check_settings(settings)
+    def fit(self, plans: VectorPlans, *, generator: torch.Generator | None = None) -> Self:
         plans = self.training_plans(plans)
-        if None in self._given.values():
-            learning, held_out = held_out_split(plans, generator_on(generator, "cpu"))
-            if not len(learning.windows(self.match + self.horizon)):
-                # Too few to hold any out: on those that are stored the least noise would look best.
-                self.bandwidth, self.noise = self._given["bandwidth"] or BANDWIDTH, self._given["noise"] or NOISE
-                self._store(plans, self.max_windows, False)
-                return self
-            lengths, order = held_out.mask().sum(1).sort(descending=True, stable=True)
-            enough = max(int((lengths.cumsum(0) <= MOST_CHOSEN_ON).sum()), 1)
-            held_out = held_out[order[:enough]].steps(0, MOST_CHOSEN_ON)
-            scores, bandwidth = {}, self._given["bandwidth"]
-            for own in (False, True):
-                least = self._store(learning, min(self.max_windows, MOST_CHOSEN_WITH), own)
-                noises = [self._given["noise"]] if self._given["noise"] else [each for each in NOISES if each >= least]
-                bandwidths = [bandwidth] if bandwidth else [each for each in BANDWIDTHS if each >= 2.5 * least]
-                for self.bandwidth, self.noise in product(bandwidths, noises):
-                    scores[self.bandwidth, self.noise, own] = mean_nats(self, held_out)
-                self.bandwidth, self.noise, own = best_of(scores)
-                bandwidth = self.bandwidth
-        else:
-            own = False
-        self._store(plans, self.max_windows, own)
+        learning, held_out = held_out_split(plans, generator_on(generator, "cpu"))
+        if not len(learning.windows(self.match + self.horizon)):
+            # Too few to hold any out: on those that are stored the least noise would look best.
+            self.bandwidth, self.noise = BANDWIDTH, NOISE
+            self._store(plans, self.max_windows, False)
+            return self
+        lengths, order = held_out.mask().sum(1).sort(descending=True, stable=True)
+        enough = max(int((lengths.cumsum(0) <= MAX_VECTORS_CHOSEN_ON).sum()), 1)
+        held_out = held_out[order[:enough]].steps(0, MAX_VECTORS_CHOSEN_ON)
+        nats: dict[tuple[float, float, bool], float] = {}
+        for each in (False, True):
+            least = self._store(learning, min(self.max_windows, MAX_WINDOWS_CHOSEN_WITH), each)
+            bandwidths = [self.bandwidth] if nats else [one for one in BANDWIDTHS if one >= 2.5 * least]
+            for self.bandwidth, self.noise in product(bandwidths, [one for one in NOISES if one >= least]):
+                nats[self.bandwidth, self.noise, each] = self._mean_nats(held_out)
+            self.bandwidth, self.noise, in_proportion = max(nats, key=nats.__getitem__)
+        self._store(plans, self.max_windows, in_proportion)
         return self
 
-    def _store(self, plans: VectorPlans, most: int, own: bool) -> float:
-        """Store the windows; with `own`, the units of distances are in proportion to the spread of each dimension.
+    @torch.no_grad()
+    def _mean_nats(self, plans: VectorPlans) -> float:
+        """The mean log-density of a vector of `plans`, nats; -inf where it is not a number."""
+        total = float(self.action_log_probs(plans).double().sum() / plans.mask().sum())
+        return total if total == total else float("-inf")
+
+    def _store(self, plans: VectorPlans, most: int, in_proportion: bool) -> float:
+        """Store the windows; the units of distances may be in proportion to the spread of each dimension.
 
         Returns:
-            The least noise to try, at most `ORDINARY`: not below `least_std` in any dimension.
+            The least noise to try, at most `MAX_LEAST_NOISE`: not below `min_std` in any dimension.
         """
         size = self.match + self.horizon
         windows = plans.windows(size)
         if not len(windows):
             raise ValueError(
-                f"plans: none has {size} vectors, match and horizon together; the longest has"
+                f"`plans` must have one of {size} vectors, `match` and `horizon` together, got at most"
                 f" {int(plans.mask().sum(1).max())}"
             )
         if len(windows) > most:
@@ -175,13 +163,13 @@ class StoredWindows(VectorPrior):
         variance = self.segments.var((0, 1), correction=0)
         std, stds, means = variance.mean().sqrt(), variance.sqrt(), self.segments.mean((0, 1))
         error = rounding(self, means)
-        least = least_std(std, error.min())
-        extent = (EXTENT * std).maximum(least / ORDINARY).clamp(max=1)
-        if own and std > 0:
-            least = least_std(stds, error)
-            extent = (extent * stds / std).maximum(least / ORDINARY)
+        least = min_std(std, error.min())
+        extent = (MAX_EXTENT_STDS * std).maximum(least / MAX_LEAST_NOISE).clamp(max=1)
+        if in_proportion and std > 0:
+            least = min_std(stds, error)
+            extent = (extent * stds / std).maximum(least / MAX_LEAST_NOISE)
         self.extent = extent.expand(self.action_size).contiguous()
-        return min(float((least / extent).max().maximum(FINE * std / extent.mean())), ORDINARY)
+        return min(float((least / extent).max().maximum(FINE_NOISE * std / extent.mean())), MAX_LEAST_NOISE)
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         empty = torch.zeros(batch_size, 2 + self.match * self.action_size, device=self.device)

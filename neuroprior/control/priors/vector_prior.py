@@ -1,50 +1,37 @@
 """The interface of a prior over vectors in time, and what it predicts: a distribution over the next vector."""
 
-import warnings
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from math import log, pi
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_same_names, check_sizes
+from neuroprior._checks import check_memory, check_same_names, check_sizes, kind_of
 from neuroprior._random import generator_on
-from neuroprior.control.vector_plans import VectorPlans, as_floats, check_widths, same_bounds
-from neuroprior.control.worlds.continuous_world import check_vectors
+from neuroprior.control.vector_plans import (
+    VectorPlans,
+    as_floats,
+    check_bounds,
+    check_finite,
+    check_vectors,
+)
 from neuroprior.priors.saved import SavedModule
-
-COARSE = 0.02
-"""Standard deviations of less than this, in units of half the range, are lost in networks and in bins."""
 
 INNERMOST = 1 - 2**-24
 """The largest float32 number below 1."""
 
 
-class Forecast(Protocol):
-    """A distribution over the next vector, for N rows.
+class GaussianForecast(NamedTuple):
+    """A distribution over the next vector, for N rows: a mixture of K censored Gaussians.
 
     Vectors are between bounds, and a share of them lies on the bounds (an actuator saturates). A distribution is
     therefore *censored*: inside the bounds it is a density, and at a bound it is the probability of being there, of
     all that would lie beyond. `log_prob` is the logarithm of the density with respect to length inside the bounds plus
     a unit mass at each bound, in each dimension; over these it integrates to one.
-    """
 
-    def log_prob(self, vector: Tensor) -> Tensor:
-        """Nats `[N]` of `vector [N, D]`."""
-
-    def sample(self, generator: torch.Generator) -> Tensor:
-        """Independent vectors `[N, D]` between the bounds."""
-
-    def repeat_interleave(self, times: int) -> "Forecast":
-        """The same distribution `times` times a row, `[N * times]` rows."""
-
-
-class GaussianForecast(NamedTuple):
-    """A mixture of K censored Gaussians over the next vector; all priors but the discretised one predict this.
-
-    Within a component, dimension d depends on those before it as they are, between the bounds: its mean is
+    In the last component dimension d may depend on those before it as they are, between the bounds: its mean is
     `mean[d] + coupling[d, :d] @ (vector[:d] - mean[:d])`, its standard deviation `std[d]`. Each dimension is then a
     censored Gaussian by itself, and the density of the vector is exact.
 
@@ -52,9 +39,9 @@ class GaussianForecast(NamedTuple):
         mean: `[N, K, D]`.
         std: `[N, K, D]` or broadcast to it, above 0.
         low, high: `[D]`, the bounds.
-        log_weights: `[N, K]`, logarithms of the components' probabilities, or None for equal ones.
-        coupling: `[D, D]` or `[N, k, D, D]`, strictly lower triangular, of all components or of the last k of them, or
-            None; the dimensions of the others are independent.
+        log_weights: `[N, K]`, logarithms of the components' probabilities; None: there is one component.
+        coupling: `[D, D]` or `[N, D, D]`, strictly lower triangular, of the last component; None: all dimensions are
+            independent, as they are in the other components.
     """
 
     mean: Tensor
@@ -65,20 +52,21 @@ class GaussianForecast(NamedTuple):
     coupling: Tensor | None = None
 
     def log_prob(self, vector: Tensor) -> Tensor:
-        value = vector[:, None]
-        mean, coupling = self.mean, self.coupling
-        if coupling is not None:
-            first = 0 if coupling.dim() == 2 else mean.shape[1] - coupling.shape[1]
-            coupled = mean[:, first:] + (coupling @ (value - mean[:, first:])[..., None])[..., 0]
-            mean = torch.cat([mean[:, :first], coupled], 1) if first else coupled
-        each = censored_log_prob(value, mean, self.std, self.low, self.high).sum(-1)
+        """Nats `[N]` of `vector [N, D]`."""
+        mean = self.mean
+        if self.coupling is not None:
+            last = mean[:, -1]
+            last = last + (self.coupling @ (vector - last)[..., None])[..., 0]
+            mean = torch.cat([mean[:, :-1], last[:, None]], 1)
+        each = censored_log_prob(vector[:, None], mean, self.std, self.low, self.high).sum(-1)
         if self.log_weights is None:
-            return each.logsumexp(-1) - log(each.shape[-1])
+            return each[:, 0]
         return (each + self.log_weights.log_softmax(-1)).logsumexp(-1)
 
     def sample(self, generator: torch.Generator) -> Tensor:
+        """Independent vectors `[N, D]` between the bounds."""
         mean = self.mean
-        several = mean.shape[1] > 1
+        several = self.log_weights is not None
         uniform = torch.rand(len(mean), generator=generator, device=mean.device) if several else None
         noise = torch.randn(mean[:, 0].shape, generator=generator, device=mean.device, dtype=mean.dtype)
         return self.drawn(uniform, noise)
@@ -90,40 +78,35 @@ class GaussianForecast(NamedTuple):
             uniform: `[N]`, uniform from 0 to 1: choose the component; None: there is one.
             noise: `[N, D]`, standard normal.
         """
-        mean, std, coupling = self.mean, self.std.expand(self.mean.shape), self.coupling
-        row = torch.arange(len(mean), device=mean.device)
-        if uniform is None:
-            chosen = torch.zeros_like(row)
-        elif self.log_weights is None:
-            chosen = (uniform * mean.shape[1]).long().clamp(max=mean.shape[1] - 1)
-        else:
+        last, row = self.mean.shape[1] - 1, torch.arange(len(self.mean), device=self.mean.device)
+        chosen = torch.zeros_like(row)
+        if uniform is not None and self.log_weights is not None:
             up_to = self.log_weights.softmax(-1).cumsum(-1)
-            chosen = torch.searchsorted(up_to, uniform[:, None] * up_to[:, -1:])[:, 0].clamp(max=mean.shape[1] - 1)
-        mean = mean[row, chosen]
-        noise = noise * std[row, chosen]
-        if coupling is None:
+            chosen = torch.searchsorted(up_to, uniform[:, None] * up_to[:, -1:])[:, 0].clamp(max=last)
+        mean = self.mean[row, chosen]
+        noise = noise * self.std.expand(self.mean.shape)[row, chosen]
+        if self.coupling is None:
             return (mean + noise).clamp(self.low, self.high)
-        if coupling.dim() == 4:
-            among = chosen - (self.mean.shape[1] - coupling.shape[1])
-            coupling = coupling[row, among.clamp(min=0)] * (among >= 0)[:, None, None]
+        coupling = self.coupling * (chosen == last)[:, None, None]
         parts: list[Tensor] = []
         for d in range(mean.shape[-1]):
             centre = mean[:, d]
             if d:
                 before = torch.stack(parts, -1) - mean[:, :d]
-                centre = centre + (coupling[..., d, :d] * before).sum(-1)
+                centre = centre + (coupling[:, d, :d] * before).sum(-1)
             parts.append((centre + noise[:, d]).clamp(self.low[d], self.high[d]))
         return torch.stack(parts, -1)
 
     def repeat_interleave(self, times: int) -> "GaussianForecast":
-        def repeated(values: Tensor | None, each: int) -> Tensor | None:
-            rows = values is not None and values.dim() == each and len(values) == len(self.mean)
-            return values.repeat_interleave(times, 0) if rows and values is not None else values
+        """The same distribution `times` times a row, `[N * times]` rows."""
+
+        def repeat(values: Tensor | None) -> Tensor | None:
+            return None if values is None else values.repeat_interleave(times, 0)
 
         mean = self.mean.repeat_interleave(times, 0)
         std = self.std.expand_as(self.mean).repeat_interleave(times, 0)
-        weights, coupling = repeated(self.log_weights, 2), repeated(self.coupling, 4)
-        return GaussianForecast(mean, std, self.low, self.high, weights, coupling)
+        coupling = self.coupling if self.coupling is None or self.coupling.dim() == 2 else repeat(self.coupling)
+        return GaussianForecast(mean, std, self.low, self.high, repeat(self.log_weights), coupling)
 
 
 def censored_log_prob(value: Tensor, mean: Tensor, std: Tensor, low: Tensor, high: Tensor) -> Tensor:
@@ -185,13 +168,7 @@ class VectorPrior(SavedModule):
         super().__init__()
         self.action_names = None
         low, high = as_floats("action_low", action_low).clone(), as_floats("action_high", action_high).clone()
-        if low.dim() != 1 or low.shape != high.shape or not len(low):
-            raise ValueError(
-                f"action_low, action_high: D numbers each are expected, not {list(low.shape)} and {list(high.shape)}"
-            )
-        if not bool((low < high).all() & low.isfinite().all() & high.isfinite().all()):
-            raise ValueError(f"action_low, action_high: finite, low below high, not {low.tolist()} and {high.tolist()}")
-        check_widths(low, high)
+        check_bounds(low, high)
         if context_size is not None:
             check_sizes(context_size=context_size)
         self.action_size, self.context_size = len(low), context_size
@@ -219,9 +196,7 @@ class VectorPrior(SavedModule):
         """What `nn.Module` moves a module by; also refuses another precision, in which not every prior computes."""
         dtype = fn(self.action_low).dtype
         if dtype != self.action_low.dtype:
-            raise ValueError(
-                f"{type(self).__name__}: priors over vectors compute in single precision, torch.float32, not in {dtype}"
-            )
+            raise ValueError(f"priors over vectors must compute in single precision, torch.float32, got {dtype}")
         applied: Self = super()._apply(fn, recurse)
         return applied
 
@@ -247,11 +222,11 @@ class VectorPrior(SavedModule):
 
     def restore(self, learned: dict[str, Any]) -> None:
         super().restore(learned)
-        names = learned.get("action_names")  # which older files do not have
+        names = learned["action_names"]
         self.action_names = None if names is None else tuple(map(str, names))
 
     @abstractmethod
-    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Forecast, Tensor]:
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         """Before the first vector.
 
         Args:
@@ -263,7 +238,7 @@ class VectorPrior(SavedModule):
         """
 
     @abstractmethod
-    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Forecast, Tensor]:
+    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         """After one more vector.
 
         Args:
@@ -273,35 +248,31 @@ class VectorPrior(SavedModule):
         """
 
     @abstractmethod
-    def fit(self, plans: VectorPlans, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
+    def fit(self, plans: VectorPlans, *, generator: torch.Generator | None = None) -> Self:
         """Learn from executed plans.
 
         Args:
             plans: with the same bounds, and features as context where this prior takes them.
             generator: source of randomness, where learning needs one.
-            settings: those of `fit_settings`.
 
         Raises:
-            ValueError: plans that this prior cannot learn from, or a setting that it does not have.
+            ValueError: plans that this prior cannot learn from.
         """
 
-    def read(self, past: Tensor, context: Tensor | None = None) -> tuple[Forecast, Tensor]:
+    def read(self, past: Tensor, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         """After the vectors `past [N, T, D]`, T >= 0, of which the last `memory` are read.
 
         Args:
             past: vectors that were executed.
-            context: `[N, C]`, or `[N, T + 1, C]`, one before each vector and that of the next; None for a prior without
-                context.
+            context: `[N, T + 1, C]`, one before each vector and that of the next; None for a prior without context.
         """
-        if self.memory is not None:
-            past = past[:, max(past.shape[1] - self.memory, 0) :]
-        each = context is not None and context.dim() == 3
-        if each and context is not None:
-            context = context[:, context.shape[1] - past.shape[1] - 1 :]
-        forecast, state = self.start(len(past), context[:, 0] if each and context is not None else context)
-        for t in range(past.shape[1]):
-            now = context[:, t + 1] if each and context is not None else None
-            forecast, state = self.step(past[:, t], state, now)
+        steps = past.shape[1] if self.memory is None else min(past.shape[1], self.memory)
+        past = past[:, past.shape[1] - steps :]
+        if context is not None:
+            context = context[:, context.shape[1] - steps - 1 :]
+        forecast, state = self.start(len(past), None if context is None else context[:, 0])
+        for t in range(steps):
+            forecast, state = self.step(past[:, t], state, None if context is None else context[:, t + 1])
         return forecast, state
 
     @torch.no_grad()
@@ -334,24 +305,25 @@ class VectorPrior(SavedModule):
         batch = len(context) if context is not None and context.dim() else 1
         past = torch.zeros(batch, 0, self.action_size) if past is None else as_floats("past", past)
         past = past.to(self.device)
-        if past.dim() != 3 or past.shape[2] != self.action_size:
-            raise ValueError(f"past: vectors [B, T, {self.action_size}] are expected, not {list(past.shape)}")
+        if past.dim() != 3:
+            raise ValueError(f"`past` must have shape [B, T, {self.action_size}], got {list(past.shape)}")
         check_vectors("past", past, self.action_low, self.action_high)
         self.check_context(context, len(past))
-        if context is not None and context.dim() == 3 and context.shape[1] != past.shape[1] + 1:
-            raise ValueError(
-                f"context: features {[len(past), past.shape[1] + 1, self.context_size]}, one before each vector of the"
-                f" past and those of the next, are expected, not {list(context.shape)}"
-            )
-        if context is not None and not context.isfinite().all():
-            where = (~context.isfinite()).nonzero()[0].tolist()
-            raise ValueError(f"context{where}: {float(context[tuple(where)])} is not a finite number")
+        steps = past.shape[1] + 1
+        context = context_per_step(context, steps)
+        if context is not None:
+            if context.shape[1] != steps:
+                raise ValueError(
+                    f"`context` must have shape {[len(past), steps, self.context_size]}, one before each vector of the"
+                    f" past and that of the next, got {list(context.shape)}"
+                )
+            check_finite("context", context)
         return self.continuations(num_plans, length, past, context, generator_on(generator, self.device))
 
     def continuations(
         self, num_plans: int, length: int, past: Tensor, context: Tensor | None, generator: torch.Generator
     ) -> Tensor:
-        """As `sample`, with checked arguments; a subclass that can draw whole plans at once does so here."""
+        """As `sample`, with checked arguments and a context per step; a subclass may draw whole plans at once here."""
         forecast, state = self.read(past, context)
         forecast, state = forecast.repeat_interleave(num_plans), state.repeat_interleave(num_plans, 0)
         vectors = [forecast.sample(generator)]
@@ -362,7 +334,7 @@ class VectorPrior(SavedModule):
         return plans.view(len(past), num_plans, length, self.action_size)
 
     def log_prob(self, plans: VectorPlans) -> Tensor:
-        """Nats `[N]` of plans, a censored density; see `Forecast`.
+        """Nats `[N]` of plans, a censored density; see `GaussianForecast`.
 
         Raises:
             ValueError: plans with other bounds, or another context than this prior's.
@@ -377,43 +349,49 @@ class VectorPrior(SavedModule):
         """
         self.check_plans(plans)
         plans = plans.to(self.device)
-        actions, context = plans.actions, plans.context
+        actions, context = plans.actions, context_per_step(plans.context, plans.max_length)
         if not plans.max_length or not len(plans):
             return torch.zeros(actions.shape[:2], device=self.device)
-        each = context is not None and context.dim() == 3
-        forecast, state = self.start(len(plans), context[:, 0] if each and context is not None else context)
-        parts = []
-        for t in range(plans.max_length):
+        forecast, state = self.start(len(plans), None if context is None else context[:, 0])
+        parts = [forecast.log_prob(actions[:, 0])]
+        for t in range(1, plans.max_length):
+            forecast, state = self.step(actions[:, t - 1], state, None if context is None else context[:, t])
             parts.append(forecast.log_prob(actions[:, t]))
-            if t + 1 < plans.max_length:
-                now = context[:, t + 1] if each and context is not None else None
-                forecast, state = self.step(actions[:, t], state, now)
         return torch.stack(parts, 1).masked_fill(~plans.mask(), 0)
 
     def check_context(self, context: Tensor | None, num_plans: int) -> None:
         """Raise ValueError unless `context` is `[num_plans, C]` or `[num_plans, T, C]`, or None for a prior without."""
         if self.context_size is None:
             if context is not None:
-                raise ValueError("context: this prior takes none; leave it out (plans.without_context())")
-            return
-        if context is None:
-            raise ValueError("context: this prior takes features, and none were given")
-        if context.dim() not in (2, 3) or len(context) != num_plans or context.shape[-1] != self.context_size:
+                raise ValueError("`context` must be None for a prior without (plans.without_context())")
+        elif (
+            context is None
+            or context.dim() not in (2, 3)
+            or len(context) != num_plans
+            or context.shape[-1] != self.context_size
+        ):
             raise ValueError(
-                f"context: features [{num_plans}, {self.context_size}], or such per step, are expected, not"
-                f" {list(context.shape)}"
+                f"`context` must be features [{num_plans}, {self.context_size}], or such per step, got"
+                f" {None if context is None else list(context.shape)}"
             )
 
     def check_plans(self, plans: VectorPlans) -> None:
         """Raise ValueError unless `plans` have this prior's names and bounds, and its kind of context."""
         if not isinstance(plans, VectorPlans):
-            raise ValueError(f"plans: VectorPlans are expected, not {type(plans).__name__}")
-        for name in ("action_low", "action_high"):
-            own, theirs = getattr(self, name).cpu(), getattr(plans, name).cpu()
-            if not same_bounds(own, theirs, 2 * self.half_range.cpu()):
-                raise ValueError(f"{name}: {theirs.tolist()} in the plans, {own.tolist()} in this prior")
+            raise ValueError(f"`plans` must be VectorPlans, got {kind_of(plans)}")
+        self.check_same_bounds(plans, "the plans")
         check_same_names("action_names", self.action_names, plans.action_names, "the plans", "this prior")
         self.check_context(plans.context, len(plans))
+
+    def check_same_bounds(self, other: Any, what: str) -> None:
+        """Raise ValueError unless the bounds of `other`, plans or a world, are those of this prior.
+
+        A hundred-thousandth of the range makes no difference.
+        """
+        for name in ("action_low", "action_high"):
+            own, theirs = getattr(self, name), getattr(other, name).to(self.device)
+            if own.shape != theirs.shape or not bool(((own - theirs).abs() <= 2e-5 * self.half_range).all()):
+                raise ValueError(f"`{name}` of {what} must be that of the prior, {own.tolist()}, got {theirs.tolist()}")
 
     @property
     def learns_anew(self) -> bool:
@@ -435,7 +413,7 @@ class VectorPrior(SavedModule):
         try:
             self.check_plans(plans)
             if not plans.mask().any():
-                raise ValueError("plans: none has a vector to learn from")
+                raise ValueError("`plans` must have a vector to learn from, got none")
         except ValueError:
             self.action_names = known
             raise
@@ -443,27 +421,7 @@ class VectorPrior(SavedModule):
             self.action_names = tuple(map(str, plans.action_names))
         return plans[plans.mask().any(1)].to(self.device)
 
-    def warn_if_coarse(self, plans: VectorPlans) -> None:
-        """Warn where the bounds of a dimension are so wide that what vectors do in it is lost to this prior."""
-        std = self.scaled(plans.actions)[plans.mask()].std(0, correction=0)
-        coarse = ((std > 0) & (std < COARSE)).nonzero()[:, 0].tolist()
-        if coarse:
-            d = coarse[0]
-            warnings.warn(
-                f"dimension {d} has a standard deviation of {float(std[d] * self.half_range[d]):.2g} between bounds"
-                f" {float(self.action_low[d]):.4g} and {float(self.action_high[d]):.4g}, of which {type(self).__name__}"
-                " learns little; give plans and prior narrower bounds",
-                stacklevel=3,
-            )
 
-    @property
-    def fit_settings(self) -> tuple[str, ...]:
-        """The names of the settings that `fit` takes."""
-        return ()
-
-    def check_settings(self, settings: Mapping[str, Any]) -> None:
-        """Raise ValueError unless `fit` takes all of these settings."""
-        for name in settings:
-            if name not in self.fit_settings:
-                known = ", ".join(self.fit_settings) or "none"
-                raise ValueError(f"{name}: not a setting of {type(self).__name__}.fit, which takes {known}")
+def context_per_step(context: Tensor | None, steps: int) -> Tensor | None:
+    """The context `[N, steps, C]` before each of so many vectors; that of whole plans, `[N, C]`, is the same at all."""
+    return context if context is None or context.dim() == 3 else context[:, None].expand(-1, steps, -1)

@@ -2,14 +2,13 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from typing import Self
 
 import torch
 from torch import Tensor
 
-from neuroprior._checks import kind_of
-from neuroprior.control.vector_plans import check_widths
+from neuroprior._checks import is_number, kind_of
+from neuroprior.control.vector_plans import as_floats, check_bounds, check_finite, check_vectors
 from neuroprior.worlds.world import Rollout, join_states, moved
 
 
@@ -82,7 +81,7 @@ class ContinuousWorld(ABC):
         now = state.repeat_interleave(num_plans, 0)
         rewards, states = [torch.zeros(batch, num_plans, 0, device=state.device)], []
         for t in range(length):
-            now, reward = outcome_of(now, self.step(now, plans[:, :, t].flatten(0, 1), generator))
+            now, reward = check_outcome(now, self.step(now, plans[:, :, t].flatten(0, 1), generator))
             rewards.append(reward.view(batch, num_plans, 1))
             if keep_states:
                 states.append(now)
@@ -99,117 +98,71 @@ class ContinuousWorld(ABC):
         return torch.zeros(state.shape[0], dtype=torch.bool, device=state.device)
 
     def check_bounds(self) -> None:
-        """Raise ValueError unless the bounds are tensors `[D]` of finite float32 numbers, the lower below the upper."""
+        """Raise ValueError unless the bounds are float32 tensors `[D]` of ranges that float32 resolves."""
         for name in ("action_low", "action_high"):
             bound = getattr(self, name)
-            known = isinstance(bound, Tensor) and bound.dtype == torch.float32 and bound.dim() == 1 and len(bound)
-            if not known or not bound.isfinite().all():
-                raise ValueError(f"{name}: a tensor [D] of finite float32 numbers is expected, not {bound!r}")
-        low, high = self.action_low, self.action_high
-        if low.shape != high.shape or not (low < high).all():
-            raise ValueError(
-                f"action_low, action_high: each lower bound below its upper bound is expected, not {low.tolist()} and"
-                f" {high.tolist()}"
-            )
-        check_widths(low, high)
+            if not isinstance(bound, Tensor) or bound.dtype != torch.float32:
+                raise ValueError(f"`{name}` must be a float32 tensor, got {bound!r}")
+        check_bounds(self.action_low, self.action_high)
 
     def check_state(self, state: Tensor) -> None:
         """Raise ValueError where `state` cannot be a batch of this world's states, or is not finite."""
         if not isinstance(state, Tensor) or state.dim() == 0:
-            raise ValueError("state: a tensor of shape [B, ...] is expected, not a single number or another type")
+            raise ValueError(f"`state` must be a tensor of shape [B, ...], got {kind_of(state)}")
         if self.state_shape is not None and not (
             state.is_floating_point() and tuple(state.shape[1:]) == self.state_shape
         ):
             shape = ", ".join(map(str, ("B", *self.state_shape)))
-            raise ValueError(
-                f"state: floating point numbers [{shape}] are expected, not {state.dtype} {list(state.shape)}"
-            )
-        if not state.isfinite().all():
-            where = (~state.isfinite()).nonzero()[0].tolist()
-            raise ValueError(f"state{where}: {float(state[tuple(where)])} is not a finite number")
+            raise ValueError(f"`state` must be floating point numbers [{shape}], got {state.dtype} {list(state.shape)}")
+        check_finite("state", state)
 
     def check_plans(self, plans: Tensor, batch_size: int) -> None:
         """Raise ValueError unless `plans` are vectors `[batch_size, P, L, D]` between the bounds."""
         if not isinstance(plans, Tensor) or plans.dim() != 4 or len(plans) != batch_size:
-            given = list(plans.shape) if isinstance(plans, Tensor) else type(plans).__name__
-            raise ValueError(f"plans: shape [B, P, L, D] with B = {batch_size} starts is expected, not {given}")
+            given = list(plans.shape) if isinstance(plans, Tensor) else kind_of(plans)
+            raise ValueError(f"`plans` must have shape [B, P, L, D] with B = {batch_size} starts, got {given}")
         check_vectors("plans", plans, self.action_low, self.action_high)
 
 
 def check_is_continuous(world: object) -> None:
     """Raise ValueError unless it is a `ContinuousWorld` whose bounds are right."""
     if not isinstance(world, ContinuousWorld):
-        raise ValueError(f"world: a ContinuousWorld, whose actions are vectors, is expected, not {kind_of(world)}")
+        raise ValueError(f"`world` must be a ContinuousWorld, whose actions are vectors, got {kind_of(world)}")
     world.check_bounds()
 
 
-def outcome_of(state: Tensor, outcome: object) -> tuple[Tensor, Tensor]:
-    """`outcome` of a step from `state [N, ...]`: the next state and the reward.
+def check_outcome(state: Tensor, outcome: object) -> tuple[Tensor, Tensor]:
+    """Returns the next state and the reward of a step from `state [N, ...]`.
 
     Raises:
-        ValueError: it is not a state of the same shape and dtype, and a floating point reward `[N]`.
+        ValueError: `outcome` is not a state of the same shape and dtype, and a floating point reward `[N]`.
     """
     if not isinstance(outcome, tuple) or [isinstance(part, Tensor) for part in outcome] != [True, True]:
-        kinds = [type(part).__name__ for part in outcome] if isinstance(outcome, tuple) else type(outcome).__name__
-        raise ValueError(f"step: a tuple of two tensors, the next state and the reward, is expected, not {kinds}")
+        kinds = [kind_of(part) for part in outcome] if isinstance(outcome, tuple) else kind_of(outcome)
+        raise ValueError(f"`step` must return two tensors, the next state and the reward, got {kinds}")
     after, reward = outcome
     if after.shape != state.shape or after.dtype != state.dtype:
         raise ValueError(
-            f"step: a next state of {state.dtype} {list(state.shape)}, as the state, is expected, not {after.dtype}"
+            f"`step` must return a next state of {state.dtype} {list(state.shape)}, as the state, got {after.dtype}"
             f" {list(after.shape)}"
         )
     if reward.shape != state.shape[:1] or not reward.is_floating_point():
         raise ValueError(
-            f"step: a floating point reward [{len(state)}] is expected, not {reward.dtype} {list(reward.shape)}"
+            f"`step` must return a floating point reward [{len(state)}], got {reward.dtype} {list(reward.shape)}"
         )
     return after, reward
-
-
-def check_vectors(name: str, vectors: Tensor, low: Tensor, high: Tensor) -> None:
-    """Raise ValueError unless `vectors [..., D]` are floating point numbers between `low [D]` and `high [D]`.
-
-    A millionth of the range beyond the bounds is taken for rounding.
-
-    Args:
-        name: what messages call them.
-        vectors, low, high: the vectors and their bounds.
-
-    Example:
-        >>> check_vectors("actions", torch.zeros(3, 2), torch.tensor([-1.0, -1.0]), torch.tensor([1.0, 1.0]))
-    """
-    if not vectors.is_floating_point():
-        raise ValueError(
-            f"{name}: floating point numbers are expected, not {str(vectors.dtype).removeprefix('torch.')}"
-        )
-    if not vectors.dim() or vectors.shape[-1] != len(low):
-        raise ValueError(f"{name}: vectors of {len(low)} numbers are expected, not {list(vectors.shape)}")
-    slack = 1e-6 * (high - low)
-    inside = (vectors >= low - slack) & (vectors <= high + slack)
-    if not inside.all():
-        where = (~inside).nonzero()[0].tolist()
-        d = where[-1]
-        raise ValueError(
-            f"{name}{where}: {float(vectors[tuple(where)]):g} is not between the bounds of dimension {d},"
-            f" {float(low[d]):g} and {float(high[d]):g}"
-        )
 
 
 def check_positive(zero: bool = False, **numbers: object) -> None:
     """Raise ValueError, naming the argument, unless all are finite numbers above 0, or 0 where `zero`."""
     for name, number in numbers.items():
-        real = isinstance(number, int | float) and not isinstance(number, bool) and math.isfinite(number)
-        if not real or not (number > 0 or (zero and number == 0)):  # type: ignore[operator]
-            raise ValueError(
-                f"{name}: a finite number {'of at least' if zero else 'above'} 0 is expected, not {number!r}"
-            )
+        if not is_number(number) or not math.isfinite(number) or not (number > 0 or (zero and number == 0)):
+            raise ValueError(f"`{name}` must be finite and {'at least' if zero else 'above'} 0, got {number!r}")
 
 
-def finite_vector(name: str, values: Sequence[float] | Tensor | object, size: int) -> Tensor:
+def finite_vector(name: str, values: object, size: int) -> Tensor:
     """`values` as float32 `[size]`; ValueError, naming the argument, unless they are `size` finite numbers."""
-    try:
-        vector = torch.as_tensor(values, dtype=torch.float32)
-    except (RuntimeError, TypeError, ValueError):
-        vector = torch.empty(0)
+    vector = as_floats(name, values)
     if vector.shape != (size,) or not vector.isfinite().all():
-        raise ValueError(f"{name}: {size} finite numbers are expected, not {values!r}")
+        raise ValueError(f"`{name}` must be {size} finite numbers, got {values!r}")
     return vector

@@ -56,7 +56,7 @@ class MujocoWorld(ContinuousWorld):
         self.num_positions, self.num_velocities = int(self.model.nq), int(self.model.nv)
         self.state_shape = (1 + self.num_positions + self.num_velocities,)
         if self._state_size != self.state_shape[0]:
-            raise ValueError(f"{file}: a model without activations, plugins or histories is expected")
+            raise ValueError(f"{file} must have no activations, plugins or histories")
         self.seconds = float(self.model.opt.timestep) * frame_skip
         bounds = torch.from_numpy(self.model.actuator_ctrlrange.copy()).float()
         self.action_low, self.action_high = bounds.unbind(1)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from neuroprior._checks import is_number
 from neuroprior._random import generator_on
 from neuroprior.control.worlds.continuous_world import finite_vector
 from neuroprior.control.worlds.mujoco import MujocoWorld
@@ -39,13 +40,11 @@ def from_mujoco(
         ImportError: MuJoCo or Gymnasium is not installed.
     """
     if task in RUNNERS:
-        if goal is not None and (
-            isinstance(goal, bool) or not isinstance(goal, int | float) or not math.isfinite(goal)
-        ):
-            raise ValueError(f"goal: of {task} a speed in m/s is expected, a finite number, not {goal!r}")
+        if goal is not None and not (is_number(goal) and math.isfinite(goal)):
+            raise ValueError(f"`goal` of {task} must be a finite speed in m/s, got {goal!r}")
         return _Runner(RUNNERS[task], masses, goal, num_threads)
     if task not in REACHERS:
-        raise ValueError(f"task: one of {', '.join((*RUNNERS, *REACHERS))} is expected, not {task!r}")
+        raise ValueError(f"`task` must be one of {', '.join((*RUNNERS, *REACHERS))}, got {task!r}")
     target = None if goal is None else finite_vector("goal", goal, 2).double()
     return REACHERS[task](masses, target, num_threads)
 
@@ -123,7 +122,7 @@ class _Reacher(MujocoWorld):
     def __init__(self, masses: float, goal: Tensor | None, num_threads: int | None) -> None:
         super().__init__("reacher.xml", 2, masses, num_threads)
         if goal is not None and not bool((goal.abs() <= 0.27).all()):
-            raise ValueError(f"goal: numbers from -0.27 to 0.27 m are expected, not {goal.tolist()}")
+            raise ValueError(f"`goal` must be from -0.27 to 0.27 m, got {goal.tolist()}")
         self.goal = goal
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:

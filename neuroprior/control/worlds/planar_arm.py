@@ -9,8 +9,11 @@ from neuroprior._checks import check_sizes
 from neuroprior._random import generator_on
 from neuroprior.control.worlds.continuous_world import ContinuousWorld, check_positive, finite_vector
 
-START = 0.1
+START_STD = 0.1
 """Standard deviation of the first angles about the stretched arm, in radians."""
+
+STEP_SECONDS, MAX_TORQUE = 0.05, 2.0
+"""The duration of a step, and the bound of the first joint's torque, in N m."""
 
 
 class PlanarArm(ContinuousWorld):
@@ -19,7 +22,7 @@ class PlanarArm(ContinuousWorld):
     The base is at the origin and the stretched arm 1 m long. A state is `[N, 2 * n]` float32: the angle of each joint
     (rad; that of the first against the x axis, of the others against the link before; 0: straight), then their speeds
     (rad/s). The dynamics are those of the coupled links (inertia and centrifugal terms; no gravity) with damped joints,
-    by semi-implicit Euler steps of `step_seconds / num_substeps` in which damping is implicit: of first order, and
+    by semi-implicit Euler steps of .05 s / `num_substeps` in which damping is implicit: of first order, and
     stable. Joint j, counted from 0, is weaker and less damped than the first by the factor (1 - j / n)².
 
     Obstacles do not block the arm, they cost: the reward of a step is minus the distance of the hand to the goal, minus
@@ -32,9 +35,7 @@ class PlanarArm(ContinuousWorld):
         masses: a factor of the mass, and so the inertia, of all links, which weigh 1 kg together at 1.
         goal: `[2]`, where the hand should be, in m.
         obstacles: circles `[M, 3]`: x, y and radius, in m; M may be 0.
-        step_seconds: the duration of a step.
         num_substeps: steps of the integrator in a step.
-        max_torque: the bound of the first joint's torque, in N m.
         damping: of the first joint, in N m s.
         control_cost, obstacle_cost: see above.
 
@@ -54,26 +55,24 @@ class PlanarArm(ContinuousWorld):
         masses: float = 1.0,
         goal: Sequence[float] | Tensor = (0.0, 0.9),
         obstacles: Sequence[Sequence[float]] | Tensor = ((0.6, 0.5, 0.25),),
-        step_seconds: float = 0.05,
         num_substeps: int = 2,
-        max_torque: float = 2.0,
         damping: float = 0.5,
         control_cost: float = 0.01,
         obstacle_cost: float = 20.0,
     ) -> None:
         check_sizes(num_links=num_links, num_substeps=num_substeps)
-        check_positive(masses=masses, step_seconds=step_seconds, max_torque=max_torque)
+        check_positive(masses=masses)
         check_positive(zero=True, damping=damping, control_cost=control_cost, obstacle_cost=obstacle_cost)
         self.goal = finite_vector("goal", goal, 2)
         self.obstacles = torch.stack(
             [finite_vector(f"obstacles[{i}]", circle, 3) for i, circle in enumerate(obstacles)] or [torch.zeros(3)]
         )[: len(obstacles)]
         if not bool((self.obstacles[:, 2] > 0).all()):
-            raise ValueError("obstacles: radii above 0 are expected")
-        self.step_seconds, self.num_substeps = float(step_seconds), num_substeps
+            raise ValueError("`obstacles` must have radii above 0")
+        self.num_substeps = num_substeps
         self.control_cost, self.obstacle_cost = float(control_cost), float(obstacle_cost)
         strength = (1 - torch.arange(num_links) / num_links).square()
-        self.action_high = max_torque * strength
+        self.action_high = MAX_TORQUE * strength
         self.action_low = -self.action_high
         self.state_shape = (2 * num_links,)
         # In absolute angles the kinetic energy is half the sum of coupling[i, j] cos(angle_i - angle_j) v_i v_j.
@@ -89,13 +88,13 @@ class PlanarArm(ContinuousWorld):
         """The arm at rest, nearly stretched along the x axis: each angle normal with standard deviation 0.1."""
         device = self.action_low.device
         draws = generator_on(generator, device)
-        angles = START * torch.randn(batch_size, self.action_size, generator=draws, device=device)
+        angles = START_STD * torch.randn(batch_size, self.action_size, generator=draws, device=device)
         return torch.cat([angles, torch.zeros_like(angles)], -1)
 
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         action, joints = action.to(state), self._joints.to(state)
         coupling, damping = self._coupling.to(state), self._damping.to(state)
-        seconds = self.step_seconds / self.num_substeps
+        seconds = STEP_SECONDS / self.num_substeps
         angle, speed = state.view(len(state), 2, -1).cumsum(-1).unbind(1)  # absolute, of the links
         torque = action @ joints
         for _ in range(self.num_substeps):

@@ -88,11 +88,16 @@ def test_only_what_the_prior_reads_is_remembered(share, memory, kept):
         assert remembered.mean.shape == (2, 3, 2)
 
 
-@pytest.mark.parametrize("make", PLANNERS)
-def test_a_prior_with_context_is_given_what_was_observed(make):
-    world = Cart()
-    done = control(make(4, 6, prior=drift(world, context_size=3)), world, world.reset(2, seeded(0)), 4, seeded(1))
-    assert done.rewards.isfinite().all()
+def test_runs_that_go_on_keep_their_own_memory():
+    world = Cart(last=5)
+    state = world.reset(4, seeded(0))
+    state[:, 2] = torch.tensor([0.0, 3.0, 1.0, 4.0])
+    prior = drift(world)
+    prior.memory = None
+    planner = Recorded(MPPIPlanner(4, 4, prior=prior))
+    done = control(planner, world, state, 5, seeded(1))
+    for t, remembered in enumerate(planner.memories[1:], 1):
+        assert remembered.past.equal(done.plans.actions[done.plans.lengths > t, :t])
 
 
 def test_control_beats_doing_nothing():
@@ -113,13 +118,6 @@ def test_a_plan_that_is_too_short_is_named():
         control(ShootingPlanner(3, 4), world, state, 5, replan_every=4)
     with refuses("num_steps"):
         control(ShootingPlanner(3, 4), world, state, 0)
-
-
-def test_no_runs_at_all():
-    world = Cart()
-    done = control(ICEMPlanner(3, 8), world, world.reset(0), 5, seeded(0))
-    assert done.rewards.shape == (0, 5)
-    assert len(done.plans) == 0
 
 
 def test_rewards_keep_the_precision_of_the_world():

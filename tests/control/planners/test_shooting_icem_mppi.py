@@ -51,17 +51,6 @@ def test_the_share_is_that_of_all_candidates_that_are_drawn(make, share, number)
 
 
 @pytest.mark.parametrize("make", PLANNERS)
-def test_without_a_share_the_prior_changes_nothing(make):
-    world = Cart()
-    state = world.reset(4, seeded(0))
-    plain = make(6, 16).plan(world, state, seeded(1))
-    other = make(6, 16, prior=drift(world), prior_share=0.0).plan(world, state, seeded(1))
-    assert plain.plan.equal(other.plan)
-    assert plain.score.equal(other.score)
-    assert plain.memory.mean.equal(other.memory.mean)
-
-
-@pytest.mark.parametrize("make", PLANNERS)
 def test_a_prior_goes_on_from_the_past_and_the_context(make):
     """With hardly any noise all candidates of a share of 1 are known."""
     world = Seen()
@@ -104,14 +93,16 @@ def test_icem_scales_noise_of_a_prior_as_its_own():
     world = Seen()
     state = world.reset(1, seeded(0))
     how = {"prior": drift(world, std=0.1), "prior_share": 1.0, "prior_as": "noise", "prior_iterations": None}
-    planner = ICEMPlanner(3, 60, iterations=2, momentum=0.0, keep_elites=0.0, std=0.7, **how)
+    planner = ICEMPlanner(3, 60, iterations=2, std=0.7, **how)
     planner.plan(world, state, seeded(1))
     first, second = (tried[0] for tried in world.tried)
     elites = first[world.rollout(state, first[None])[1][0].sum(-1).topk(planner.num_elites).indices]
-    mean, std = elites.mean(0), elites.std(0, correction=0)
+    half = (world.action_high - world.action_low) / 2
+    middle = (world.action_low + world.action_high) / 2
+    mean = 0.9 * elites.mean(0) + 0.1 * middle
+    std = 0.9 * elites.std(0, correction=0) + 0.1 * 0.7 * half
     drawn = drift(world, std=0.1).sample(2 * 59, 3, past=torch.zeros(1, 0, 2), generator=seeded(1))[0]
     noise = ((drawn[:59] - drawn[59:]) / 2**0.5)[len(first) :]
-    half = (world.action_high - world.action_low) / 2
     wanted = (mean + std / (0.7 * half) * noise).clamp(world.action_low, world.action_high)
     assert torch.allclose(second[:-1], wanted, atol=1e-5)
     assert torch.allclose(second[-1], mean, atol=1e-6)
@@ -142,22 +133,6 @@ def test_a_budget_is_divided_exactly(number, sizes, elites):
     assert [plans.shape[1] for plans in world.tried] == sizes
 
 
-def test_icem_tries_its_mean_and_the_elites_of_the_last_decision():
-    world = Seen()
-    state = world.reset(2, seeded(0))
-    planner = ICEMPlanner(4, 30)
-    first = planner.plan(world, state, seeded(1))
-    kept = first.memory.elites
-    assert kept.shape == (2, planner.num_kept, 4, 2)
-    memory = first.memory.moved_on(first.plan[:, :1], world.observe(state)[:, None], planner.keep)
-    world.tried.clear()
-    second = planner.plan(world, state, seeded(2), memory)
-    again = world.tried[0][:, -planner.num_kept :]
-    assert again[:, :, :3].equal(kept[:, :, 1:])
-    assert not again[:, :, 3].equal(kept[:, :, 3])
-    assert second.score.ge(-1e9).all()
-
-
 def test_warm_started_shooting_is_never_worse_than_the_last_plan():
     world = Cart()
     state = world.reset(50, seeded(0))
@@ -167,8 +142,6 @@ def test_warm_started_shooting_is_never_worse_than_the_last_plan():
         decision = planner.plan(world, state, seeded(seed), memory)
         assert (decision.score >= last).all()
         memory, last = decision.memory, decision.score
-    cold = ShootingPlanner(6, 4, warm_start=False)
-    assert cold.plan(world, state, seeded(9), memory).plan.equal(cold.plan(world, state, seeded(9)).plan)
 
 
 @pytest.mark.parametrize("make", [ShootingPlanner, ICEMPlanner])
@@ -182,34 +155,9 @@ def test_ties_are_broken_at_random(make):
     assert decision.plan.flatten(1).unique(dim=0).shape[0] > 800
 
 
-def test_mppi_weighs_equally_good_candidates_equally():
-    class Tried(Constant):
-        def rollout(self, state, plans, generator=None, keep_states=False):
-            self.plans = plans
-            return super().rollout(state, plans, generator, keep_states)
-
-    world = Tried()
-    decision = MPPIPlanner(3, 5).plan(world, world.reset(2), seeded(0))
-    assert torch.allclose(decision.plan, world.plans.mean(1), atol=1e-6)
-
-
-@pytest.mark.parametrize("make", PLANNERS)
-def test_more_candidates_find_better_plans(make):
-    """Two hundred starts: a difference of more than 5 standard errors (one-sided, below 1e-6)."""
-    world = Cart()
-    state = world.reset(200, seeded(0))
-
-    def found(number):
-        plan = make(8, number).plan(world, state, seeded(1)).plan
-        return world.rollout(state, plan[:, None]).rewards.sum((1, 2))
-
-    gain = found(128) - found(8)
-    assert gain.mean() > 5 * gain.std() / 200**0.5
-
-
 @pytest.mark.parametrize("make", PLANNERS)
 def test_a_reward_that_is_no_number_is_named(make):
-    with refuses("NaN", "reward"):
+    with refuses("`score` must be a number, got NaN"):
         make(3, 4).plan(Constant(float("nan")), torch.zeros(2, 1), seeded(0))
     if make is MPPIPlanner:
         with refuses("infinite"):
@@ -231,20 +179,17 @@ def test_the_objective_has_a_discount_and_a_value(make):
 @pytest.mark.parametrize(
     ("make", "how", "word"),
     [
-        (ShootingPlanner, {"std": 0.0}, "std"),
-        (ShootingPlanner, {"noise_beta": -1.0}, "noise_beta"),
-        (ICEMPlanner, {"decay": 0.9}, "decay"),
-        (ICEMPlanner, {"momentum": 1.0}, "momentum"),
-        (ICEMPlanner, {"keep_elites": 1.5}, "keep_elites"),
+        (ShootingPlanner, {"std": 0.0}, "`std` must be finite and above 0, got 0.0"),
+        (ShootingPlanner, {"noise_beta": -1.0}, "`noise_beta` must be finite and at least 0, got -1.0"),
         (ICEMPlanner, {"elites": 0}, "elites"),
         (ICEMPlanner, {"iterations": 0}, "iterations"),
         (ICEMPlanner, {"prior_iterations": 0}, "prior_iterations"),
         (MPPIPlanner, {"temperature": 0.0}, "temperature"),
-        (MPPIPlanner, {"control_cost": True, "noise_beta": 1.0}, "control_cost"),
+        (MPPIPlanner, {"control_cost": True, "noise_beta": 1.0}, "`noise_beta` must be 0"),
         (MPPIPlanner, {"prior_share": 0.5}, "prior_share"),
-        (MPPIPlanner, {"prior": 3}, "prior"),
-        (MPPIPlanner, {"prior_as": "changes"}, "prior_as"),
-        (ShootingPlanner, {"adapt_share": "no"}, "adapt_share: True or False"),
+        (MPPIPlanner, {"prior": 3}, "`prior` must be a VectorPrior, got int"),
+        (MPPIPlanner, {"prior_as": "changes"}, "`prior_as`"),
+        (ShootingPlanner, {"adapt_share": "no"}, "adapt_share"),
     ],
 )
 def test_bad_settings_are_named(make, how, word):
@@ -263,7 +208,7 @@ def test_a_prior_with_other_bounds_and_a_memory_of_other_runs_are_refused(make):
     decision = make(3, 8).plan(world, state, seeded(0))
     with refuses("decision.memory"):
         make(3, 8).plan(world, state, seeded(0), decision)
-    with refuses("memory: elites of shape [2, ..., 2]"):
+    with refuses("`memory.elites` must have shape [2, ..., 2], got [3, 1, 2, 2]"):
         make(3, 8).plan(world, state, seeded(0), decision.memory._replace(elites=torch.zeros(3, 1, 2, 2)))
 
 
@@ -301,5 +246,5 @@ def test_mppi_weighs_candidates_by_rewards_of_any_size(scale):
 def test_a_prior_that_takes_other_features_is_refused(make):
     world = Cart()  # shows three numbers
     planner = make(3, 8, prior=drift(world, context_size=2), prior_share=0.5)
-    with refuses("prior", "2 features", "[3]"):
+    with refuses("`prior` must take the features of the world, [3], got one that takes 2"):
         planner.plan(world, world.reset(2))

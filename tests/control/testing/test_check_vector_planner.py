@@ -17,11 +17,11 @@ from tests.support.sources import refuses
 
 PLANNERS = {
     "shooting": ShootingPlanner,
-    "coloured": partial(ShootingPlanner, noise_beta=2.0, warm_start=False),
+    "coloured": partial(ShootingPlanner, noise_beta=2.0),
     "icem": ICEMPlanner,
-    "first": partial(ICEMPlanner, prior_iterations=1, keep_elites=0.0, iterations=2),
+    "all": partial(ICEMPlanner, prior_iterations=None, iterations=2),
     "mppi": MPPIPlanner,
-    "plain": partial(MPPIPlanner, normalise=False, control_cost=True, iterations=3),
+    "plain": partial(MPPIPlanner, normalise=False, control_cost=True),
     "value": partial(ICEMPlanner, discount=0.8, value=lambda state: state[:, 0]),
     "far": partial(ShootingPlanner, value=lambda state: 50 * state.norm(dim=-1)),
 }
@@ -132,7 +132,7 @@ def test_a_planner_of_ones_own_conforms():
     ("make", "word"),
     [
         (partial(OfSamples, worst=True), "random plans"),
-        (partial(OfSamples, clamped=False), "not between the bounds"),
+        (partial(OfSamples, clamped=False), "must be between the bounds"),
         (spoilt(lambda decision, world: decision._replace(score=decision.score + 1)), "score"),
         (spoilt(lambda decision, world: decision._replace(plan=decision.plan + 5)), "bounds"),
         (spoilt(lambda decision, world: decision._replace(plan=decision.plan[:, :, :1])), "shapes"),

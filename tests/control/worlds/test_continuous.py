@@ -82,10 +82,10 @@ def test_the_linear_quadratic_regulator_reaches_its_own_cost():
 
 
 def test_a_single_link_turns_as_a_rod():
-    """A rod of 1 kg and 1 m about its end has the inertia 1 / 3; masses are a factor of it."""
-    world = PlanarArm(1, masses=2.0, damping=0.0, num_substeps=1, obstacles=())
+    """A rod of 1 kg and 1 m about its end has the inertia 1 / 3; masses are a factor of it; damping is implicit."""
+    world = PlanarArm(1, masses=2.0, damping=0.3, num_substeps=1, obstacles=())
     state, _ = world.step(torch.tensor([[0.5, 0.25]]), torch.tensor([[0.4]]))
-    speed = 0.25 + 0.05 * 0.4 / (2 / 3)
+    speed = (0.25 + 0.05 * 0.4 / (2 / 3)) / (1 + 0.05 * 0.3 / (2 / 3))
     torch.testing.assert_close(state, torch.tensor([[0.5 + 0.05 * speed, speed]]))
 
 
@@ -121,15 +121,14 @@ def test_links_inside_obstacles_cost_their_depth():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (partial(DoubleIntegrator, 0), "num_dimensions: an integer of at least 1"),
-        (partial(DoubleIntegrator, mass=0.0), "mass: a finite number above 0"),
-        (partial(DoubleIntegrator, mass="heavy"), "mass: a finite number above 0"),
-        (partial(DoubleIntegrator, force_cost=-1.0), "force_cost: a finite number of at least 0"),
-        (partial(DoubleIntegrator, goal=(1.0, math.nan)), "goal: 2 finite numbers"),
-        (partial(PlanarArm, masses=math.inf), "masses: a finite number above 0"),
-        (partial(PlanarArm, goal=(1.0,)), "goal: 2 finite numbers"),
-        (partial(PlanarArm, obstacles=((0.0, 1.0),)), r"obstacles\[0\]: 3 finite numbers"),
-        (partial(PlanarArm, obstacles=((0.0, 1.0, 0.0),)), "obstacles: radii above 0"),
+        (partial(DoubleIntegrator, 0), "num_dimensions"),
+        (partial(DoubleIntegrator, mass=0.0), "`mass` must be finite and above 0, got 0.0"),
+        (partial(DoubleIntegrator, mass="heavy"), "`mass` must be finite and above 0, got 'heavy'"),
+        (partial(PlanarArm, masses=math.inf), "`masses` must be finite and above 0, got inf"),
+        (partial(DoubleIntegrator, force_cost=-1.0), "`force_cost` must be finite and at least 0, got -1.0"),
+        (partial(DoubleIntegrator, goal=(1.0, math.nan)), "`goal` must be 2 finite numbers, got .*nan"),
+        (partial(PlanarArm, obstacles=((0.0, 1.0),)), r"`obstacles\[0\]` must be 3 finite numbers"),
+        (partial(PlanarArm, obstacles=((0.0, 1.0, 0.0),)), "`obstacles` must have radii above 0"),
     ],
 )
 def test_wrong_arguments(make, message):

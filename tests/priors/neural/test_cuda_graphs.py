@@ -178,10 +178,10 @@ def test_logits_of_which_nothing_can_be_drawn_are_refused(stepwise):
 
 
 def test_recorded_vectors_are_those_of_steps(stepwise):
-    stepwise.setattr("neuroprior.control.priors.networks.compiled", lambda name: None)  # loops would draw them
+    stepwise.setattr(VectorGRU, "draw", VectorGRU.draw_in_steps)  # loops would draw them
     low, high = torch.tensor([-1.0, -2.0]), torch.tensor([1.0, 3.0])
     actions = torch.randn(10, 12, 2, generator=seeded(0)).clamp(-1, 1)
-    prior = VectorGRU(low, high, width=8, lags=2).fit(VectorPlans(actions, low, high), max_steps=5, progress=False)
+    prior = VectorGRU(low, high, width=8).fit(VectorPlans(actions, low, high), max_steps=5, progress=False)
     drawn = prior.sample(6, 20, past=actions[:3, :4], generator=seeded(1))
     assert Stepwise.made == 1
     share, prior.autoregressive_share = prior.autoregressive_share, 0.9

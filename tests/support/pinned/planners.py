@@ -78,8 +78,8 @@ def planners_of_vectors():
             "shooting, fixed": ShootingPlanner(6, 24, prior=prior, prior_share=0.25, adapt_share=False),
             "icem": ICEMPlanner(6, 32, iterations=3, elites=4, prior=prior, std=0.4),
             "icem, noise": ICEMPlanner(6, 24, prior=prior, prior_as="noise", prior_iterations=None),
-            "icem, plain": ICEMPlanner(5, 30, keep_elites=0.5, momentum=0.3, decay=1.5),
-            "mppi": MPPIPlanner(6, 24, prior=prior, iterations=2),
+            "icem, plain": ICEMPlanner(5, 30),
+            "mppi": MPPIPlanner(6, 24, prior=prior),
             "mppi, costly": MPPIPlanner(5, 24, control_cost=True, normalise=False, temperature=1.0),
         }.items():
             done = control(planner, world, state, 5, seeded(1), replan_every=2)

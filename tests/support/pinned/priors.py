@@ -8,14 +8,11 @@ import torch
 from neuroprior.behaviour import LAW_NAMES, DurationModel, SemiMarkovPrior
 from neuroprior.control import (
     AutoregressivePrior,
-    DiscretisedPrior,
     NoisePrior,
     StepSynergies,
     StoredWindows,
     VectorGRU,
     VectorPlans,
-    VectorTransformer,
-    WindowSynergies,
 )
 from neuroprior.plans import Plans
 from neuroprior.priors import (
@@ -257,13 +254,10 @@ def priors_of_vectors():
         ("white", NoisePrior(*ends), {}),
         ("coloured", NoisePrior(*ends, None, memory=5), {}),
         ("autoregressive", AutoregressivePrior(*ends), {}),
-        ("window synergies", WindowSynergies(*ends, window=5), {}),
-        ("step synergies", StepSynergies(*ends, 1, order=2), {}),
+        ("synergies", StepSynergies(*ends, 1), {}),
         ("stored", StoredWindows(*ends, match=2, horizon=4, max_windows=20), {}),
-        ("discretised", DiscretisedPrior(*ends, 5, MarkovPrior(7, 3)), {}),
-        ("gru", VectorGRU(*ends, width=8, num_components=2, lags=2), few),
-        ("gru, coupled", VectorGRU(*ends, 1, width=8, coupled=True), few),
-        ("transformer", VectorTransformer(*ends, width=8, num_layers=1, num_heads=2), few),
+        ("gru", VectorGRU(*ends, width=8, num_components=2), few),
+        ("gru, context", VectorGRU(*ends, 1, width=8, num_layers=2), few),
     ):
         known = motion(context=prior.context_size is not None)
         prior.fit(known, generator=seeded(0), **how)
