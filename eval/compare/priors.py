@@ -23,7 +23,6 @@ from neuroprior import (
     load,
 )
 from neuroprior.behaviour.analysis.comparison import score
-from neuroprior.plans import is_per_step
 from neuroprior.priors.matching import numbers
 
 ORDERS = range(5)
@@ -154,7 +153,7 @@ class ContextMarkov(Prior):
         if context is None:
             raise ValueError("context: this prior takes a context, and none was given")
         number = self.index(context)
-        known = (number if is_per_step(context) else number[:, None]) < self.index.size - 1
+        known = number < self.index.size - 1
         return torch.where(known[..., None], self.chain(plans, number), self.fallback(plans))
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_range, check_single_precision, check_sizes, is_integer
 from neuroprior.plans.columns import check_distinct
-from neuroprior.plans.sequences import Sequences, check_index, counted
+from neuroprior.plans.sequences import Sequences, check_index, counted, expand_context
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -20,8 +20,8 @@ class VectorPlans(Sequences):
             nothing (stored as 0). A millionth of the range beyond the bounds is rounding, and clipped.
         action_low, action_high: `[D]` float32, finite: the bounds of each dimension; never guessed from the data.
         lengths: integers `[N]`, the number of vectors of each plan; None where all have L.
-        context: features of the states in which actions were chosen, floating point, one row per plan `[N, C]` or per
-            step `[N, L, C]`; stored as float32. None for no context.
+        context: features of the states in which actions were chosen, floating point `[N, L, C]`, stored as float32;
+            those that are given once a plan, `[N, C]`, hold at all of its steps. None for no context.
         group: integers `[N]` (subject, session, run): the plans of a group are not independent, and are held out
             together, unless there are few or very unequal ones; None if each plan is independent.
         action_names: names of the D dimensions, or None.
@@ -81,8 +81,7 @@ class VectorPlans(Sequences):
         shape = tuple(context.shape)
         if shape[:-1] not in ((num,), (num, length)):
             raise ValueError(f"`context` must have shape [{num}, C] or [{num}, {length}, C], got {list(shape)}")
-        if len(shape) == 3:
-            context = context.masked_fill(~self.mask()[..., None], 0)
+        context = expand_context(context, length).masked_fill(~self.mask()[..., None], 0)
         check_finite("context", context)
         check_single_precision("context", counted(torch.as_tensor(self.context), self.mask()))
         return context

@@ -9,7 +9,8 @@ from torch import Tensor
 from neuroprior._checks import check_memory, check_sizes, is_number, kind_of
 from neuroprior._random import generator_on
 from neuroprior.planners.planner import Decision, Planner, check_is_planner
-from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans import Plans
+from neuroprior.plans.sequences import is_per_plan
 from neuroprior.worlds.world import World, check_is_world
 
 Change = Callable[[Tensor, torch.Generator | None], Tensor]
@@ -146,7 +147,7 @@ def collect(
         plan, state, before = plan[kept], state[kept], before[kept]
         lengths = None if lengths is None else lengths[kept]
     seen = None if context is None else world.observe(state[:1])
-    if seen is not None and is_per_step(seen) and (context == "plan" or seen.dim() != 2):
+    if seen is not None and not is_per_plan(seen) and (context == "plan" or seen.dim() != 2):
         raise ValueError(
             "observe: indices [N] or floating point features [N, C] are expected of a world; patterns [N, F] are a"
             ' context per step (context="step")'

@@ -8,7 +8,7 @@ from torch import Tensor
 from neuroprior._checks import is_number
 from neuroprior.planners.planner import Decision, Objective, PriorPlanner, decide, join_decisions
 from neuroprior.sampling.draws import Draw
-from neuroprior.sampling.states import State, join_rows, map_state, numbers_in, select_rows, tensors_in
+from neuroprior.sampling.states import State, StateStore, join_rows, numbers_in, select_rows
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
 from neuroprior.worlds.tabular import TabularWorld
 from neuroprior.worlds.world import Rollout, World
@@ -120,7 +120,7 @@ class _Trees:
         reward: `[B, M]`: of the step into each node.
         state: `[B, M, ...]`: of the world at each node.
         place: `[B, M]`: where the prior's state at each node is, in `kept`.
-        kept: at each depth the prior's states at the nodes there, with room for more: the states of some priors grow.
+        kept: the prior's states at the nodes of each depth.
         size: `[B]`: nodes so far.
         left: `[B]`: simulator steps that may still be taken.
         over: `[B]`: whether they are too few for the plan that was to be tried next.
@@ -142,7 +142,7 @@ class _Trees:
         self.steps = planner.num_plans * planner.length
         self.left, self.over = torch.full_like(self.size, self.steps), torch.zeros_like(self.size, dtype=torch.bool)
         self.low, self.high = (self.total.new_full((batch,), sign * torch.inf) for sign in (1, -1))
-        self.kept, self.used = [select_rows(hidden, slice(0))] * planner.length, [0] * planner.length
+        self.kept = StateStore()
         self.place = torch.zeros(batch, 1, dtype=torch.long)
         every = torch.arange(batch)
         self._keep(every, torch.zeros_like(every), 0, self._legal(state, self.logits), hidden)
@@ -230,7 +230,7 @@ class _Trees:
         rewards = torch.nn.functional.pad(self.reward[starts[:, None], inside], (0, 1))
         states = self.state[starts[:, None], torch.nn.functional.pad(inside, (0, 1))]
         uniform, going, now = uniform.to(self.logits), rows[:0], self.state[:0, 0]
-        logits, hidden = self.logits[:0], self.kept[0]
+        logits, hidden = self.logits[:0], None
         for t in range(int(depth.min()) if len(rows) else length, length):
             # All of these plans have t actions behind them, so that the states of the prior have one shape.
             fresh = (depth == t).nonzero()[:, 0]
@@ -238,7 +238,7 @@ class _Trees:
             if len(going):
                 plan[going, t] = self.draw.actions(logits, uniform[going.to(device), t]).cpu()
             if len(fresh):
-                kept = select_rows(self.kept[t], self.place[own, node].to(device))
+                kept = self.kept.take(t, self.place[own, node])
                 hidden = join_rows(hidden, kept) if len(going) else kept
             now = torch.cat([now, self.state[own.to(device), node.to(device)]])
             going = torch.cat([going, fresh])
@@ -275,15 +275,7 @@ class _Trees:
         if not self.world.all_legal:
             state = self.state[rows.to(self.device), node.to(self.device)]
             self.closed[rows, node] = ~self.world.legal_actions(state).cpu()
-        first, last = self.used[depth], self.used[depth] + len(rows)
-        if last > len(tensors_in(self.kept[depth])[0]):
-            room = map_state(lambda values: values.new_empty(2 * last, *values.shape[1:]), hidden)
-            if first:  # else the states that are kept have no shape yet
-                map_state(lambda new, old: new[:first].copy_(old[:first]), room, self.kept[depth])
-            self.kept[depth] = room
-        map_state(lambda kept, new: kept[first:last].copy_(new), self.kept[depth], hidden)
-        self.place[rows, node] = torch.arange(first, last)
-        self.used[depth] = last
+        self.place[rows, node] = self.kept.keep(depth, hidden)
 
     def _make_room(self) -> None:
         """Double the number of nodes where one more might not fit."""

@@ -19,7 +19,7 @@ from neuroprior.plans.plans import (
     check_patterns,
     has_patterns,
 )
-from neuroprior.plans.sequences import is_per_step
+from neuroprior.plans.sequences import constant_context, expand_context
 
 __all__ = [
     "BLOCKS",
@@ -32,12 +32,13 @@ __all__ = [
     "all_plans",
     "check_context",
     "check_patterns",
+    "constant_context",
     "divisible",
+    "expand_context",
     "folds",
     "from_trajectories",
     "in_parts",
     "has_patterns",
-    "is_per_step",
     "read_minari",
     "read_plans",
     "to_trajectories",

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_same_names, check_seed, check_sizes
 from neuroprior.plans.plans import Plans
-from neuroprior.plans.sequences import Sequences, is_per_step
+from neuroprior.plans.sequences import Sequences
 
 FEWEST_UNITS = 2
 """Independent units that an interval needs; where there are fewer groups (or plans), a finer unit is taken."""
@@ -98,8 +98,6 @@ def check_alike(training: Sequences, validation: Sequences) -> None:
     for what in ("action_names", "context_names"):
         names = getattr(training, what, None), getattr(validation, what, None)
         check_same_names(f"validation: {what}", *names, "these plans", "those that are learned from")
-    if is_per_step(training.context) != is_per_step(validation.context):
-        raise ValueError("validation: a context per step, or one a plan, is expected, as in the plans learned from")
 
 
 def num_units(plans: Sequences) -> int:
@@ -179,12 +177,7 @@ def pieces(plans: Plans, most: int) -> Plans:
     place = first[:, None] + torch.arange(min(most, plans.max_length), device=lengths.device)
     place = place.minimum((lengths[row, None] - 1).clamp(min=0))
     parts = {name: getattr(plans, name) for name in ("actions", "durations", "context")}
-    each = {"actions", "durations"} | ({"context"} if is_per_step(plans.context) else set())
-    cut = {
-        name: values[row[:, None], place] if name in each else values[row]
-        for name, values in parts.items()
-        if values is not None
-    }
+    cut = {name: values[row[:, None], place] for name, values in parts.items() if values is not None}
     return replace(
         ungrouped(plans),
         **cut,

@@ -6,7 +6,6 @@ import torch
 
 from neuroprior._checks import check_sizes
 from neuroprior.plans.plans import Plans, durations_of
-from neuroprior.plans.sequences import is_per_step
 
 QUARTILES = 1.349
 """Standard deviations between the quartiles of a normal distribution."""
@@ -71,7 +70,7 @@ class PastDurations:
         """The plans with these features as their context, behind the features that they have already.
 
         Args:
-            plans: N plans with durations; without a context, or with features `[N, C]` or `[N, L, C]`.
+            plans: N plans with durations; without a context, or with features.
 
         Returns:
             Plans with the context `[N, L, C + 2k]`, float32.
@@ -94,6 +93,5 @@ class PastDurations:
             before[:, self.number - lag : self.number - lag + plans.max_length] for lag in range(1, self.number + 1)
         ]
         if own is not None:
-            each = own if is_per_step(own) else own[:, None].expand(-1, plans.max_length, -1)
-            parts.insert(0, each.float())
+            parts.insert(0, own.float())
         return replace(plans, context=torch.cat(parts, -1), context_names=None)

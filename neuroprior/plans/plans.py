@@ -13,7 +13,7 @@ from torch.nn import functional
 from neuroprior._checks import check_count, check_memory, check_range, check_sizes, is_integer
 from neuroprior.plans.columns import Columns, Missing, check_distinct, fields_of_events
 from neuroprior.plans.rows import check_readable, rows_of
-from neuroprior.plans.sequences import Sequences, check_index, is_per_step
+from neuroprior.plans.sequences import Sequences, check_index, expand_context
 
 MOST_BITS = 48
 """The most binary digits of the number of plans that `all_plans` lists, on any machine."""
@@ -35,9 +35,10 @@ class Plans(Sequences):
         num_actions: the number of actions, A; never guessed from the data.
         lengths: integers `[N]`, the number of actions of each plan; None where all have L.
         action_names: A names, or None.
-        context: what is known when actions are chosen, such as the agent's observations: indices (integers), one per
-            plan `[N]` or per step `[N, L]`; several per step, `[N, L, F]`, stored as int32: the patterns that are
-            active in each state; or features (floating point) `[N, C]` or `[N, L, C]`; None for no context.
+        context: what is known before each action, such as the agent's observation: indices (integers) `[N, L]`;
+            features (floating point) `[N, L, C]`; several indices, `[N, L, F]`, stored as int32: the patterns that are
+            active in each state; None for no context. What is given once a plan, `[N]` or `[N, C]`, is the context of
+            all of its steps.
         group: integers `[N]` (subject, session, world): the plans of a group are not independent, and are held out
             together (see `CombinedPrior` for an exception); None if each plan is independent.
         context_names: names of the context indices, numbered from 0, or None.
@@ -127,7 +128,8 @@ class Plans(Sequences):
         if self.context is not None:
             context = _tensor("context", self.context)
             check_context(context, num, length)
-            object.__setattr__(self, "context", context.to(torch.int32) if has_patterns(context) else context)
+            context = context.to(torch.int32) if has_patterns(context) else expand_context(context, length)
+            object.__setattr__(self, "context", context)
         for what in ("action", "context", "group", "condition"):
             if _check_texts(f"{what}_names", getattr(self, f"{what}_names")):
                 check_distinct(f"{what}_names", getattr(self, f"{what}_names"))
@@ -241,8 +243,8 @@ class Plans(Sequences):
         """A pandas frame of these plans, one action a row, which `from_dataframe` reads.
 
         Columns: `plan` and `action`, names where there are any, else numbers; and, where the plans have them, `context`
-        (or `context_1`, `context_2`, ..., features), `group`, `condition` and `duration`. A context per plan is
-        repeated on its rows, and read back as one per step. A row without an action is between two parts of one plan.
+        (or `context_1`, `context_2`, ..., features), `group`, `condition` and `duration`. A row
+        without an action is between two parts of one plan.
 
         `Plans.from_dataframe(frame, num_actions=...)`, or with `action_names=`, gives the same plans; other names
         are numbered in sorted order then.
@@ -260,7 +262,7 @@ class Plans(Sequences):
         lengths = self.mask().sum(1)
         if not lengths.all():
             raise ValueError(f"plans: plan {int((lengths == 0).nonzero()[0])} has no actions, and so no row")
-        header, *rows = rows_of(self, True, is_per_step(self.context))
+        header, *rows = rows_of(self, True)
         cells = [[None if cell == "" else cell for cell in row] for row in rows]
         frame = pd.DataFrame(cells, columns=header, dtype=object)
         whole = frame.columns[frame.notna().all()]  # beside gaps pandas would make numbers of actions floats
@@ -270,7 +272,7 @@ class Plans(Sequences):
     def with_end(self, name: str = "end") -> "Plans":
         """The same plans, each closed by one action more, number A, that stands for the end of the plan.
 
-        A prior that learns from them predicts when plans end, and samples plans of unequal lengths. A context per step
+        A prior that learns from them predicts when plans end, and samples plans of unequal lengths. The last context
         is repeated for the added action.
 
         Args:
@@ -284,11 +286,11 @@ class Plans(Sequences):
         lengths = self.mask().sum(1)
         actions = functional.pad(self.actions.long(), (0, 1)).scatter(1, lengths[:, None], self.num_actions)
         context = self.context
-        if context is not None and is_per_step(context):
+        if context is not None:
             last = (lengths - 1).clamp(min=0)
             closing = context[torch.arange(len(self), device=context.device), last] if self.max_length else None
             if closing is None:
-                raise ValueError("context: plans without any action have no context per step to repeat")
+                raise ValueError("context: plans without any action have no context to repeat")
             context = torch.cat([context, torch.zeros_like(context[:, :1])], 1)
             context[torch.arange(len(self), device=context.device), lengths] = closing
         names = None if self.action_names is None else (*self.action_names, name)

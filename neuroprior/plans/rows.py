@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from neuroprior.plans.columns import is_missing, named, number_in
+from neuroprior.plans.sequences import constant_context
 
 
 def check_readable(plans: Any, place: str, kind: str) -> None:
@@ -33,15 +34,14 @@ def check_readable(plans: Any, place: str, kind: str) -> None:
                 raise ValueError(f"{place}: {what}_names: {kind} cannot hold {name!r}, which would be read as a number")
 
 
-def rows_of(plans: Any, by_step: bool, per_step: bool) -> Iterator[list[Any]]:
+def rows_of(plans: Any, by_step: bool) -> Iterator[list[Any]]:
     """The rows of a table, the header first; with one step a row, plans without names are numbered from 0.
 
     Between two parts of one plan there is a row without an action, a gap.
 
     Args:
         plans: `Plans` that `check_readable` lets pass.
-        by_step: one step a row; else one plan.
-        per_step: whether their context is one per step.
+        by_step: one step a row; else one plan, whose context never changes.
     """
     width = plans.max_length
     plan_names, parted = _plan_column(plans) if by_step else (plans.plan_names, frozenset())
@@ -55,7 +55,8 @@ def rows_of(plans: Any, by_step: bool, per_step: bool) -> Iterator[list[Any]]:
     for start in range(0, len(plans), 2**14):
         some = plans[start : start + 2**14]
         none: list[list[Any]] = [[]] * len(some)
-        contexts = none if some.context is None else named(some.context.tolist(), plans.context_names)
+        given = some.context if by_step else constant_context(some)
+        contexts = none if given is None else named(given.tolist(), plans.context_names)
         own = [
             named(values.tolist(), names)
             for values, names in ((some.group, plans.group_names), (some.condition, plans.condition_names))
@@ -70,13 +71,13 @@ def rows_of(plans: Any, by_step: bool, per_step: bool) -> Iterator[list[Any]]:
             called = i if plan_names is None else plan_names[i]
             if by_step:
                 if i in parted:
-                    blank = [""] * (len(_as_list(context[0] if per_step else context)))
+                    blank = [""] * (len(_as_list(context[0])) if context else 0)
                     yield [called, "", *blank, *group, *([] if times is None else [""])]
                 yield from (
                     [
                         called,
                         taken[t],
-                        *_as_list(context[t] if per_step else context),
+                        *_as_list(context[t] if context else []),
                         *group,
                         *_time(times, i - start, t),
                     ]

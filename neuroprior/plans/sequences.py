@@ -29,7 +29,7 @@ class Sequences(ABC):
     Attributes:
         actions: `[N, L, ...]`.
         lengths: integers `[N]`, the number of actions of each plan; None where all have L.
-        context: what actions depend on, one per plan or per step; None for no context.
+        context: what is known before each action, `[N, L]` or `[N, L, C]`; None for no context.
         group: integers `[N]`: the plans of a group are not independent; None if each plan is independent.
     """
 
@@ -96,8 +96,7 @@ class Sequences(ABC):
         stop = self.max_length if stop is None else min(stop, self.max_length)
         if stop < min(first, self.max_length):
             raise ValueError(f"stop: at least {first}, the first action, is expected, not {stop}")
-        each = ["actions", "durations", *(["context"] if is_per_step(self.context) else [])]
-        parts = {name: getattr(self, name, None) for name in each}
+        parts = {name: getattr(self, name, None) for name in ("actions", "durations", "context")}
         cut = {name: values[:, first:stop] for name, values in parts.items() if values is not None}
         if self.lengths is not None:
             cut["lengths"] = (self.lengths - first).clamp(0, max(stop - first, 0))
@@ -140,21 +139,41 @@ def counted(features: Tensor, mask: Tensor) -> Tensor:
     return features[mask] if features.dim() == 3 else features
 
 
-def is_per_step(context: Tensor | None) -> bool:
-    """True for a context per step (`[N, L]`, `[N, L, F]`, `[N, L, C]`), False for none or one per plan.
-
-    The patterns `[N, F]` of one state each look like indices per step: callers that expect patterns check for these
-    first.
+def is_per_plan(context: Tensor) -> bool:
+    """Returns whether a context is given once a plan: indices `[N]` or features `[N, C]`.
 
     Example:
-        >>> (
-        ...     is_per_step(torch.zeros(4, 5, dtype=torch.long)),
-        ...     is_per_step(torch.zeros(4, dtype=torch.long)),
-        ...     is_per_step(None),
-        ... )
-        (True, False, False)
+        >>> is_per_plan(torch.zeros(4, dtype=torch.long)), is_per_plan(torch.zeros(4, 5, dtype=torch.long))
+        (True, False)
     """
-    return context is not None and (context.dim() == 3 or (is_integer(context) and context.dim() == 2))
+    return context.dim() == (1 if is_integer(context) else 2)
+
+
+def expand_context(context: Tensor, length: int) -> Tensor:
+    """Returns the context before each step, `[N, L]` or `[N, L, C]`; one that is given once a plan holds throughout.
+
+    Example:
+        >>> expand_context(torch.tensor([5, 3]), 2).tolist()
+        [[5, 5], [3, 3]]
+    """
+    if not is_per_plan(context):
+        return context
+    return context[:, None].expand(len(context), length, *context.shape[1:])
+
+
+def constant_context(plans: Sequences) -> Tensor | None:
+    """Returns the context of each plan, `[N]` or `[N, C]`, where it never changes within a plan; else None.
+
+    Example:
+        >>> constant_context(Plans(torch.zeros(2, 3, dtype=torch.long), 2, context=torch.tensor([5, 3]))).tolist()
+        [5, 3]
+    """
+    context = plans.context
+    if context is None or plans.max_length == 0 or (is_integer(context) and context.dim() == 3):
+        return None
+    first = context[:, :1]
+    same = (context == first) if context.dim() == 2 else (context == first).all(-1)
+    return first[:, 0] if bool((same | ~plans.mask()).all()) else None
 
 
 def check_validation(share: object) -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans import Plans
 from neuroprior.plans.columns import listed
 from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors.prior import Prior, as_actions
@@ -129,7 +129,7 @@ def with_contexts_of(prior: Prior, plans: Plans, is_table: bool) -> tuple[Plans,
         return plans, []
     if known is None:
         return plans, [numbered_note("contexts", names or ())]
-    occurring = (context[plans.mask()] if is_per_step(context) else context).unique()
+    occurring = context[plans.mask()].unique()
     names = tuple(map(str, occurring.tolist()))
     if is_table and names and set(names) <= set(known):
         # What stands behind the end of a plan is none of them.

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from neuroprior._checks import check_memory, check_range, check_same_names, check_sizes, is_integer, kind_of
-from neuroprior.plans import Plans, check_context, check_patterns, has_patterns, is_per_step
+from neuroprior.plans import Plans, check_context, check_patterns, constant_context, has_patterns
 from neuroprior.plans.past_durations import PastDurations
+from neuroprior.plans.sequences import is_per_plan
 from neuroprior.priors.saved import SavedModule
 from neuroprior.sampling import ancestral as sampling
 from neuroprior.sampling.draws import after_end
@@ -26,8 +27,8 @@ class Prior(SavedModule):
     same number of actions behind them.
 
     `context` is the observation that actions depend on: indices below `num_contexts`, features of size `context_size`,
-    or `num_patterns` active patterns; one of the three. It is given once per plan (`[N]`, `[N, C]`: that of the start)
-    or before each action (`[N, L]`, `[N, L, C]`); patterns always before each action, `[N, L, F]`.
+    or `num_patterns` active patterns; one of the three. There is one before each action: `[N, L]`, `[N, L, C]` or
+    `[N, L, F]`.
 
     Args:
         num_actions: A.
@@ -36,8 +37,9 @@ class Prior(SavedModule):
         num_patterns: F, for a prior that takes the active patterns of each state: integers from 0 to 2**31 - 1.
 
     Attributes:
-        context_per: "plan" or "step", as it was in the plans that the prior learned from ("step" before that); None
-            for a prior without context.
+        context_per: "plan" where the context never changed within the plans that the prior learned from, so that in a
+            world it is shown the observation of the start alone; "step" where it did, and before it learned; None for a
+            prior without context.
         end: the action that ends a plan, as it was in the plans that the prior learned from (see `Plans.with_end`), or
             None. After it, it has probability 1 in `log_prob` and in samples.
         action_names, context_names: names of the actions and contexts, as they were in these plans, or None.
@@ -203,21 +205,20 @@ class Prior(SavedModule):
 
         Args:
             plans: integers `[N, L]`.
-            context: None, one a plan or one a step.
+            context: None, or `[N, L]`, `[N, L, C]` or `[N, L, F]`.
 
         Returns:
             Logits `[N, L, A]`, equal to those that stepping gives. This default steps.
         """
         num, length = plans.shape
-        per_step = is_per_step(context)
         if length == 0:
             return torch.zeros(num, 0, self.num_actions, device=self.device)
         out = []
-        logits, state = self.start(num, context[:, 0] if context is not None and per_step else context)
+        logits, state = self.start(num, None if context is None else context[:, 0])
         for t in range(length):
             out.append(logits)
             if t + 1 < length:
-                now = context[:, t + 1] if context is not None and per_step else None
+                now = None if context is None else context[:, t + 1]
                 logits, state = self.step(plans[:, t].long(), state, now)
         return torch.stack(out, 1)
 
@@ -343,8 +344,7 @@ class Prior(SavedModule):
         if has_patterns(context):
             raise ValueError(f"context: patterns {list(context.shape)}, which this prior does not take")
         if not isinstance(plans, Plans):
-            steps = context.shape[1] if is_per_step(context) else length
-            check_context(context, num_plans, steps)
+            check_context(context, num_plans, length if is_per_plan(context) else context.shape[1])
         if self.num_contexts is not None:
             if not is_integer(context):
                 kind = str(context.dtype).removeprefix("torch.")
@@ -380,7 +380,7 @@ class Prior(SavedModule):
         if not self.takes_context:
             return plans.without_context()
         self.check_context_of(plans)
-        self.context_per = "step" if is_per_step(plans.context) else "plan"
+        self.context_per = "step" if constant_context(plans) is None else "plan"
         if plans.context_names is not None and len(plans.context_names) <= (self.num_contexts or 0):
             self.context_names = tuple(plans.context_names)
         return plans
@@ -415,21 +415,18 @@ class Prior(SavedModule):
         return plans
 
     def counted_plans(self, plans: Plans | Tensor) -> Plans:
-        """As `known_plans`, of plans in which `recount` counts: their ends and contexts are like those it learned from.
+        """As `known_plans`, of plans in which `recount` counts: their ends are like those it learned from.
 
         A prior that has not learned yet keeps their names, end and kind of context, as `training_plans` says.
 
         Raises:
-            ValueError: see `known_plans`; or plans with another end, or whose context is given per step if that of the
-                plans it learned from was given per plan, or the other way round.
+            ValueError: see `known_plans`; or plans with another end.
         """
         plans = self.known_plans(plans)
         if not self.has_learned:
             return self.training_plans(plans)
         if plans.end != self.end:
             raise ValueError(f"plans: end={self.end} is expected, as in those it learned from, not {plans.end}")
-        if self.takes_context and is_per_step(plans.context) != (self.context_per == "step"):
-            raise ValueError(f"context: one per {self.context_per} is expected, as in the plans it learned from")
         return plans
 
     def check_settings(self, settings: Mapping[str, Any]) -> None:

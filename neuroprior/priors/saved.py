@@ -20,12 +20,6 @@ class SavedModule(nn.Module, ABC):
     tables: tuple[str, ...] = ()
     """Buffers whose sizes depend on what was learned, so that they are taken from the file."""
 
-    later: ClassVar[Mapping[str, float]] = {}
-    """Tensors that files of earlier versions lack, and the number in all of their places that then had no effect."""
-
-    renamed: ClassVar[Mapping[str, str]] = {}
-    """Names of tensors in files of earlier versions, and their names now."""
-
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         SavedModule.known.add(cls.__name__, cls)
@@ -56,12 +50,6 @@ class SavedModule(nn.Module, ABC):
             if prefix + name in state_dict:
                 device = getattr(self, name).device
                 self.register_buffer(name, torch.empty_like(state_dict[prefix + name], device=device))
-        for name, now in self.renamed.items():
-            if prefix + name in state_dict:
-                state_dict[prefix + now] = state_dict.pop(prefix + name)
-        own = self.state_dict() if self.later else {}
-        for name in self.later.keys() & own.keys():
-            state_dict.setdefault(prefix + name, torch.full_like(own[name], self.later[name]))
         super()._load_from_state_dict(state_dict, prefix, *args)
         if not self.tables_fit():
             raise RuntimeError(f"the tables of a {type(self).__name__} do not fit one another")

@@ -16,6 +16,7 @@ from neuroprior.priors.uniform import UniformPrior
 from neuroprior.puzzles.compiled_search import ADDITIVE, LEVIN, can_search, compiled_tables, search_all
 from neuroprior.puzzles.worlds.puzzle import PuzzleWorld
 from neuroprior.sampling.draws import check_temperature
+from neuroprior.sampling.states import State, StateStore, tensors_in
 from neuroprior.sampling.stepping import Steppable, Stepper, check_in_world
 from neuroprior.worlds.world import World
 
@@ -170,7 +171,7 @@ class BestFirstPlanner(Planner):
         return Search(torch.from_numpy(solved), plan, lengths, score, final, expansions, log_bound, steps)
 
     def _search(self, world: World, prior: Steppable, state: Tensor) -> Search:
-        trees = _Trees(self, world, _stepper(prior, world, state), state)
+        trees = _Trees(self, world, _PriorStates(prior, world, state), state)
         while len(trees.rows):
             trees.expand_best()
         return trees.result._replace(plan=pad_plans(trees.paths, world.num_actions))
@@ -266,8 +267,8 @@ class _Trees:
     path the highest log(d / pi) from the root before them (`peak`) and the lowest `World.lower_bound` (`least`).
     """
 
-    def __init__(self, planner: BestFirstPlanner, world: World, stepper: Stepper, state: Tensor) -> None:
-        self.planner, self.world, self.stepper, self.actions = planner, world, stepper, world.num_actions
+    def __init__(self, planner: BestFirstPlanner, world: World, prior: "_PriorStates", state: Tensor) -> None:
+        self.planner, self.world, self.prior, self.actions = planner, world, prior, world.num_actions
         self.lower_bound: Heuristic | None = getattr(world, "lower_bound", None) if planner.reroot else None
         batch, device = len(state), state.device
         self.rows = torch.arange(batch, device=device)
@@ -281,20 +282,20 @@ class _Trees:
             empty.clone(),
         )  # fmt: skip
         self.result.log_bound[self.result.solved] = 0.0
-        logits, hidden = stepper.start_in(world, state)
+        logits, place = self.prior.start(state)
         room = torch.zeros(batch, self.capacity, dtype=torch.float64, device=device)
         self.nodes = {
             **{name: torch.zeros_like(room, dtype=torch.long) for name in ("edge", "depth", "since")},
             **{name: torch.zeros_like(room) for name in ("log_prob", "peak", "least", "gain", "left")},
             "state": state.new_zeros(batch, self.capacity, *state.shape[1:]),
-            "hidden": hidden.new_zeros(batch, self.capacity, *hidden.shape[1:]),
+            "place": place.new_zeros(batch, self.capacity, 2),
             "action_log_prob": room.new_zeros(batch, self.capacity, self.actions),
         }
         self._make_queue(batch)
         path = {name: self.nodes[name][:, 0].clone() for name in PATH}
         path["edge"] -= 1
         path["least"] += inf
-        self._add(self.rows, path, state, logits, hidden)
+        self._add(self.rows, path, state, logits, place)
         self.size[self.result.solved] = 0
         self._drop(self.result.solved)
 
@@ -319,10 +320,10 @@ class _Trees:
         self._finish(tree[solved], {name: values[solved] for name, values in path.items()}, state[solved])
         wanted = new & ~solved
         if bool(wanted.any()):
-            hidden = node["hidden"][tree, parent][wanted]
-            logits, hidden = self.stepper.step_in(self.world, action[wanted], hidden, state[wanted])
+            place = node["place"][tree, parent][wanted]
+            logits, place = self.prior.step(action[wanted], place, state[wanted])
             path = {name: values[wanted] for name, values in path.items()}
-            self._add(tree[wanted], path, state[wanted], logits, hidden)
+            self._add(tree[wanted], path, state[wanted], logits, place)
         self._drop(solved)
 
     def _pop_edges(self, tree: Tensor) -> Tensor:
@@ -334,7 +335,7 @@ class _Trees:
         self.minima[tree, block] = blocks[tree, block].amin(1)
         return block * BLOCK + within
 
-    def _add(self, tree: Tensor, path: dict[str, Tensor], state: Tensor, logits: Tensor, hidden: Tensor) -> None:
+    def _add(self, tree: Tensor, path: dict[str, Tensor], state: Tensor, logits: Tensor, place: Tensor) -> None:
         """Expand a new node of each of the trees `[M]`, with what is known of its `path`, and queue its edges."""
         at = self.size[tree]
         self.size[tree] += 1
@@ -351,7 +352,7 @@ class _Trees:
             path |= {name: path[name].masked_fill(rooted, 0) for name in ("since", "log_prob")}
             path["least"] = path["least"].minimum(bound)
             left = bound if self.planner.heuristic is None else left
-        named = {"left": left, "state": state, "hidden": hidden, "action_log_prob": own}
+        named = {"left": left, "state": state, "place": place, "action_log_prob": own}
         for name, values in (path | named).items():
             self.nodes[name][tree, at] = values
         depth = (path["since"] + 1)[:, None].expand_as(own)
@@ -435,58 +436,41 @@ class _Trees:
         self.nodes = {name: values[kept] for name, values in self.nodes.items()}
 
 
-class _ByDepth(Stepper):
-    """Steps a prior whose states change their size, as those of networks that read a window, along with the actions.
+class _PriorStates:
+    """The prior's states at the nodes of a search, which are stepped by their places, int64 `[N, 2]`: depth and row.
 
-    Rows of its states can only be stepped together with as many actions behind them. States are kept here, by depth;
-    what is given out in their place is their depth and their row there, int64 `[N, 2]`.
+    States of networks that read a window grow with the actions behind them: those are kept by depth, and rows are
+    stepped together with as many actions behind them. All others are kept as of depth 0.
     """
 
-    def __init__(self, prior: Steppable) -> None:
-        super().__init__(prior, in_place=False)
-        self._states, self._used = list[Tensor](), list[int]()
+    def __init__(self, prior: Steppable, world: World, state: Tensor) -> None:
+        self.stepper, self.world, self.store = Stepper(prior, in_place=False), world, StateStore()
+        _, before = self.stepper.start_in(world, state[:1])
+        action = torch.zeros(len(state[:1]), dtype=torch.long, device=state.device)
+        _, after = self.stepper.step_in(world, action, before, state[:1])
+        sizes = [[values.shape[1:] for values in tensors_in(one)] for one in (before, after)]
+        self.grows = len(state) > 0 and sizes[0] != sizes[1]
 
-    def start_in(self, world: World, state: Tensor) -> tuple[Tensor, Tensor]:
-        logits, own = super().start_in(world, state)
-        return logits, self._keep(0, own)
+    def start(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits `[N, A]` at starts, and the places of the states."""
+        logits, hidden = self.stepper.start_in(self.world, state)
+        return logits, self._keep(0, hidden, state.device)
 
-    def step_in(
-        self, world: World, action: Tensor, state: Tensor, reached: Tensor, room: int = 0
-    ) -> tuple[Tensor, Tensor]:
-        parts, places = [], torch.empty_like(state)
-        for depth in state[:, 0].unique().tolist():
-            rows = (state[:, 0] == depth).nonzero()[:, 0]
-            own = self._states[depth][state[rows, 1]]
-            logits, after = super().step_in(world, action[rows], own, reached[rows])
-            places[rows] = self._keep(depth + 1, after)
+    def step(self, action: Tensor, place: Tensor, reached: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits `[N, A]` after actions that led to the world's states `reached`, and the places of the states."""
+        parts, places = [], torch.empty_like(place)
+        for depth in place[:, 0].unique().tolist():
+            rows = (place[:, 0] == depth).nonzero()[:, 0]
+            hidden = self.store.take(depth, place[rows, 1])
+            logits, after = self.stepper.step_in(self.world, action[rows], hidden, reached[rows])
+            places[rows] = self._keep(depth + self.grows, after, place.device)
             parts.append((rows, logits))
         order = torch.cat([rows for rows, _ in parts]).argsort()
         return torch.cat([logits for _, logits in parts])[order], places
 
-    def _keep(self, depth: int, own: Tensor) -> Tensor:
-        """Where states `[M, ...]` are kept: `[M, 2]`."""
-        if depth == len(self._states):
-            self._states.append(own[:0])
-            self._used.append(0)
-        first, last = self._used[depth], self._used[depth] + len(own)
-        if last > len(self._states[depth]):
-            room = own.new_empty(2 * last, *own.shape[1:])
-            room[:first] = self._states[depth][:first]
-            self._states[depth] = room
-        self._states[depth][first:last] = own
-        self._used[depth] = last
-        row = torch.arange(first, last, device=own.device)
+    def _keep(self, depth: int, hidden: State, device: torch.device) -> Tensor:
+        row = self.store.keep(depth, hidden).to(device)
         return torch.stack([torch.full_like(row, depth), row], 1)
-
-
-def _stepper(prior: Steppable, world: World, state: Tensor) -> Stepper:
-    """How a search steps a prior from `state [B, ...]`, whose nodes have different depths."""
-    stepper = Stepper(prior, in_place=False)
-    _, before = stepper.start_in(world, state[:1])
-    if len(before) == 0:
-        return stepper
-    _, after = stepper.step_in(world, torch.zeros(1, dtype=torch.long, device=state.device), before, state[:1])
-    return stepper if after.shape == before.shape else _ByDepth(prior)
 
 
 def pad_plans(plans: Sequence[Tensor], num_actions: int) -> Tensor:

@@ -8,8 +8,8 @@ from torch import Tensor
 from neuroprior._checks import check_count, check_memory, check_range, check_sizes, is_integer
 from neuroprior._random import generator_on
 from neuroprior._threads import share
-from neuroprior.plans import is_per_step
 from neuroprior.plans.plans import action_dtype
+from neuroprior.plans.sequences import is_per_plan
 from neuroprior.sampling.draws import (
     Draw,
     are_few,
@@ -92,13 +92,13 @@ def sample(
         raise ValueError(f"context: its first dimension must be num_plans = {num_plans}, not {context.shape[0]}")
     past = _checked_past(past, num_plans, prior.num_actions).to(device)
     steps = past.shape[-1] + length
-    if context is not None and is_per_step(context) and context.shape[1] < steps:
+    if context is not None and not is_per_plan(context) and context.shape[1] < steps:
         what = "to be sampled" if steps == length else "in the past and to be sampled"
         raise ValueError(f"context: {steps} steps are {what}, but it has only {context.shape[1]}")
     stepper.check_context(context, num_plans, steps)
     draw = Draw(prior.num_actions, temperature, generator_on(generator, device))
     with stepper.threads_for(num_plans):
-        if past.dim() == 2 or (context is not None and (is_per_step(context) or not is_integer(context))):
+        if past.dim() == 2 or (context is not None and not (is_per_plan(context) and is_integer(context))):
             one_each = torch.ones(num_plans, dtype=torch.long, device=device)
             return _sample_from_roots(stepper, one_each, context, past, length, draw, "ancestral", batch_size)
         if context is None:
@@ -296,7 +296,7 @@ def _sample_from_roots(
     total = int(counts.sum())
     if total == 0 or length == 0:
         return torch.empty(total, length, dtype=draw.dtype, device=counts.device)
-    per_step = is_per_step(context)
+    per_step = context is not None and not is_per_plan(context)
     logits, state = stepper.start(len(counts), context[:, 0] if context is not None and per_step else context)
     behind = past.shape[-1]
     for t, action in enumerate(past.expand(len(counts), behind).unbind(1)):

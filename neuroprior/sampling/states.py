@@ -49,3 +49,38 @@ def tensors_in(state: State) -> list[Tensor]:
 def numbers_in(state: State) -> int:
     """Returns how many numbers a state of N plans has, N times those of a plan."""
     return sum(values.numel() for values in tensors_in(state))
+
+
+class StateStore:
+    """Keeps states of many plans, by how many actions are behind them: the states of some priors grow.
+
+    Example:
+        >>> store = StateStore()
+        >>> row = store.keep(0, torch.tensor([5, 6, 7]))
+        >>> store.take(0, row[[2, 0]])
+        tensor([7, 5])
+    """
+
+    def __init__(self) -> None:
+        self._states, self._used = list[State](), list[int]()
+
+    def keep(self, depth: int, state: State) -> Tensor:
+        """Returns the rows, int64 `[M]` on the CPU, in which states of M plans are kept from now on."""
+        while depth >= len(self._states):
+            self._states.append(None)
+            self._used.append(0)
+        first, new = self._used[depth], len(tensors_in(state)[0])
+        last, kept = first + new, self._states[depth]
+        if kept is None or last > len(tensors_in(kept)[0]):
+            room = map_state(lambda values: values.new_empty(2 * last, *values.shape[1:]), state)
+            if kept is not None:
+                map_state(lambda more, old: more[:first].copy_(old[:first]), room, kept)
+            self._states[depth] = kept = room
+        map_state(lambda all_, some: all_[first:last].copy_(some), kept, state)
+        self._used[depth] = last
+        return torch.arange(first, last)
+
+    def take(self, depth: int, row: Tensor) -> State:
+        """Returns the states that are kept in some rows."""
+        kept = self._states[depth]
+        return select_rows(kept, row.to(tensors_in(kept)[0].device))

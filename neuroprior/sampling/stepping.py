@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_same_names, is_integer
 from neuroprior._threads import one_thread
-from neuroprior.plans import is_per_step
+from neuroprior.plans.sequences import is_per_plan
 from neuroprior.sampling.draws import Draw, after_end, are_few
 from neuroprior.sampling.states import State
 from neuroprior.worlds.world import World, check_is_world
@@ -156,7 +156,7 @@ class Stepper:
         """
         check_in_world(self._prior, world, state)
         context = None if self.context_per is None else world.observe(state)
-        if context is not None and is_per_step(context) and getattr(self._prior, "num_patterns", None) is None:
+        if context is not None and not is_per_plan(context) and getattr(self._prior, "num_patterns", None) is None:
             raise ValueError(
                 f"observe: indices [N] or features [N, C] are expected, not {context.dtype} {list(context.shape)}"
             )

@@ -6,7 +6,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from neuroprior.plans import Plans, all_plans, is_per_step
+from neuroprior.plans import Plans, all_plans
 from neuroprior.priors import Prior, load, save
 from neuroprior.sampling.ancestral import sample
 from neuroprior.sampling.states import select_rows
@@ -46,51 +46,51 @@ def check_prior(prior: Any, length: int | None = None, num_plans: int = 20_000, 
         length = max((n for n in range(1, 6) if actions**n <= 1024), default=1)
     generator = torch.Generator().manual_seed(seed)
     window = getattr(prior, "window", None) or 0
-    for kind in _kinds(prior):
+    for stays in (False, True) if prior.takes_context else (False,):
         for steps in (1, length, window + 3):
             plans = torch.randint(actions, (7, steps), generator=generator).to(prior.device)
-            context = _random_context(prior, kind, 7, steps, generator)
-            _check_stepping(prior, plans, context)
-            _check_advancing(prior, plans, context)
-        _check_total(prior, _random_context(prior, kind, 1, length, generator), length)
+            context = _random_context(prior, 7, steps, generator, stays)
+            _check_stepping(prior, plans, context, stays)
+            _check_advancing(prior, plans, context, stays)
+        _check_total(prior, _random_context(prior, 1, length, generator, stays), length)
         for method in ("tree", "ancestral"):
-            context = _random_context(prior, kind, 1, length, generator)
+            context = _random_context(prior, 1, length, generator, stays)
             _check_samples(prior, context, length, num_plans, method, generator)
-        _check_seeds(prior, kind, length, generator)
+        _check_seeds(prior, length, generator)
     _check_copies(prior, length, generator)
 
 
-def _kinds(prior: Prior) -> tuple[str | None, ...]:
-    """What the prior may get a context for: patterns are those of a state, so there are none for a whole plan."""
-    return ("step",) if prior.num_patterns is not None else ("plan", "step") if prior.takes_context else (None,)
-
-
-def _random_context(prior: Prior, kind: str | None, num: int, length: int, generator: torch.Generator) -> Tensor | None:
-    """A random context of the kind that the prior takes, one a plan or one a step."""
-    shape = (num,) if kind == "plan" else (num, length)
-    if kind is None:
-        return None
+def _random_context(
+    prior: Prior, num: int, length: int, generator: torch.Generator, stays: bool = False
+) -> Tensor | None:
+    """A random context of each step, of the kind that the prior takes; one that `stays` is that of all steps."""
+    if stays:
+        once = _random_context(prior, num, 1, generator)
+        return None if once is None else once.expand(num, length, *once.shape[2:])
+    shape = (num, length)
     if prior.num_contexts is not None:
         return torch.randint(prior.num_contexts, shape, generator=generator).to(prior.device)
     if prior.num_patterns is not None:
         # Low numbers, which a prior may have learned, and one that no plans have.
         codes = torch.randint(8, (*shape, prior.num_patterns), generator=generator, dtype=torch.int32)
         return torch.where(codes == 7, 2**31 - 1, codes).to(torch.int32).to(prior.device)
-    return torch.randn(*shape, prior.context_size or 0, generator=generator).to(prior.device)
+    if prior.context_size is None:
+        return None
+    return torch.randn(*shape, prior.context_size, generator=generator).to(prior.device)
 
 
 @torch.no_grad()
-def _check_stepping(prior: Prior, plans: Tensor, context: Tensor | None) -> None:
+def _check_stepping(prior: Prior, plans: Tensor, context: Tensor | None, stays: bool) -> None:
     """`start` and `step` give what `forward` gives; reordering the state reorders the logits."""
     num, length = plans.shape
-    if context is not None and not is_per_step(context):
-        _, state = prior.start(num, context)
+    if stays:
+        _, state = prior.start(num, _at(context, 0))
         try:
             prior.step(plans[:, 0], state, None)
         except Exception as error:
             raise AssertionError(
-                f"step: {error}; where plans have one context each, `start` is given it, and `step` None:"
-                " what is needed later has to be kept in the state"
+                f"step: {error}; `step` is given None where the last context goes on: what is needed later has to be"
+                " kept in the state"
             ) from error
     whole = prior(plans, context)
     # On a GPU cuDNN reads sequences with 10 bits of mantissa (TF32), unless that is switched off.
@@ -110,7 +110,7 @@ def _check_stepping(prior: Prior, plans: Tensor, context: Tensor | None) -> None
         gap = float((logits.log_softmax(-1) - whole[:, t]).abs().nan_to_num(0).max())
         require(gap < rounding, f"stepping differs from forward by {gap:.2g} nats ({where})")
         if t + 1 < length:
-            given = _at(context, t + 1) if is_per_step(context) else None
+            given = None if stays else _at(context, t + 1)
             backwards, _ = prior.step(
                 plans[order, t], select_rows(state, order), None if given is None else given[order]
             )
@@ -119,7 +119,7 @@ def _check_stepping(prior: Prior, plans: Tensor, context: Tensor | None) -> None
             require(gap < rounding, f"reordering the state changes the logits by {gap:.2g} ({where})")
 
 
-def _check_advancing(prior: Prior, plans: Tensor, context: Tensor | None) -> None:
+def _check_advancing(prior: Prior, plans: Tensor, context: Tensor | None, stays: bool) -> None:
     """`advance` gives what `step` gives, whether there is room or not, for all plans and for some."""
     num, length = plans.shape
     with torch.no_grad():
@@ -127,7 +127,7 @@ def _check_advancing(prior: Prior, plans: Tensor, context: Tensor | None) -> Non
             logits, state = prior.start(num, _at(context, 0))
             _, other = prior.start(num, _at(context, 0))
             for t in range(length - 1):
-                given = _at(context, t + 1) if is_per_step(context) else None
+                given = None if stays else _at(context, t + 1)
                 logits, state = prior.step(plans[:, t], state, given)
                 again, other = prior.advance(plans[:, t], other, given, room)
                 gap = float((again - logits).abs().nan_to_num(0).max())
@@ -143,7 +143,7 @@ def _has_rows(state: object, num: int) -> bool:
 
 
 def _at(context: Tensor | None, t: int) -> Tensor | None:
-    return context[:, t] if context is not None and is_per_step(context) else context
+    return None if context is None else context[:, t]
 
 
 def _all_log_probs(prior: Prior, length: int, context: Tensor | None) -> Tensor:
@@ -153,14 +153,10 @@ def _all_log_probs(prior: Prior, length: int, context: Tensor | None) -> Tensor:
 
 
 def _check_total(prior: Prior, context: Tensor | None, length: int) -> None:
-    """Probabilities of all plans sum to one; a context a plan is the same context at each step."""
+    """Probabilities of all plans sum to one."""
     log_probs = _all_log_probs(prior, length, context)
     total = float(log_probs.double().exp().sum())
     require(abs(total - 1) < 1e-4, f"the probabilities of all plans of length {length} sum to {total:.6f}, not 1")
-    if context is not None and not is_per_step(context):
-        repeated = _all_log_probs(prior, length, context[:, None].repeat(1, length, *[1] * (context.dim() - 1)))
-        gap = float((repeated - log_probs).abs().max())
-        require(gap < 1e-3, f"a context a plan differs by {gap:.2g} nats from the same context at each step")
 
 
 def _check_samples(
@@ -184,9 +180,9 @@ def _check_samples(
     require(p > FALSE_ALARM, f"{method} samples do not fit log_prob: chi-square p = {p:.2g}, {num_plans} plans")
 
 
-def _check_seeds(prior: Prior, kind: str | None, length: int, generator: torch.Generator) -> None:
+def _check_seeds(prior: Prior, length: int, generator: torch.Generator) -> None:
     """The same seed gives the same plans; torch's global generator is not used."""
-    context = _random_context(prior, kind, 64, length, generator)
+    context = _random_context(prior, 64, length, generator)
     before = torch.get_rng_state()
     first, second = (prior.sample(64, length, context, generator=torch.Generator().manual_seed(1)) for _ in range(2))
     require(first.equal(second), "sample: the same seed gave other plans")
@@ -196,7 +192,7 @@ def _check_seeds(prior: Prior, kind: str | None, length: int, generator: torch.G
 @torch.no_grad()
 def _check_copies(prior: Prior, length: int, generator: torch.Generator) -> None:
     """A saved and loaded copy, and one on the GPU where there is one, say the same."""
-    context = _random_context(prior, _kinds(prior)[0], 64, length, generator)
+    context = _random_context(prior, 64, length, generator)
     plans = torch.randint(prior.num_actions, (64, length), generator=generator).to(prior.device)
     want = prior.log_prob(Plans(plans, prior.num_actions, context=context)).cpu()
     with tempfile.TemporaryDirectory() as folder:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
-from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans import Plans
 from neuroprior.plans.sequences import Sequences
 from neuroprior.training.settings import Settings
 
@@ -150,7 +150,7 @@ class Windows(Dataset[Batch]):
         place = place.clamp(max=plans.max_length - 1)
         context = plans.context
         if context is not None:
-            context = context[plan[:, None], place] if is_per_step(context) else context[plan]
+            context = context[plan[:, None], place]
         previous = None
         if self.window < plans.max_length:
             last = plans.actions[plan, (first - 1).clamp(0, plans.max_length - 1)]

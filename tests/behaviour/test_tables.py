@@ -369,7 +369,7 @@ def test_missing_labels_with_one_plan_a_row(tmp_path):
     plans = read(tmp_path, text)
     assert listed(plans) == [["a", "b"], ["a"], ["b"], ["a"], ["b"]]
     assert [plans.group_names[g] for g in plans.group] == ["x", "x", "x", "y", "y"]
-    assert plans.context.tolist() == [0, 0, 1, 2, 2]
+    assert plans.context[:, 0].tolist() == [0, 0, 1, 2, 2]
     assert "2 gaps end a plan, and the next begins after each" in plans.notes
     whole = read(tmp_path, text, missing="label")
     assert listed(whole) == [["a", "b", "missing", "a"], ["b"], ["a", "missing", "b"]]

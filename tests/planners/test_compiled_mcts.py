@@ -65,7 +65,7 @@ def reference(prior, world: TabularWorld, start: int, steps: int, generator, exp
             states.append(world.step(states[-1], torch.tensor([action]))[0])
         if prior.context_per is not None:
             seen = torch.stack([world.observe(state) for state in states], 1)
-            context = seen if prior.context_per == "step" else seen[:, 0]
+            context = seen if prior.context_per == "step" else seen[:, :1].expand_as(seen)
         return prior(torch.tensor([[*path, 0]]), context)[0, -1]
 
     tries, totals, closed, best, scores, left = {}, {}, set(), -math.inf, [], steps

@@ -38,7 +38,7 @@ def test_what_is_recorded_with_plans_was_seen_before_the_actions():
     """From the first and the second of four cells there is one best plan of three actions, to the right."""
     world, state = corridor((0.0, 0.0, 0.0, 1.0)), torch.tensor([0, 1])
     planner = ExhaustivePlanner(3, objective="return")
-    for context, seen in ((None, None), ("plan", [0, 1]), ("step", [[0, 1, 2], [1, 2, 3]])):
+    for context, seen in ((None, None), ("plan", [[0, 0, 0], [1, 1, 1]]), ("step", [[0, 1, 2], [1, 2, 3]])):
         plans = collect(planner, world, state=state, context=context)
         assert plans.actions.tolist() == [[1, 1, 1]] * 2
         assert (None if plans.context is None else plans.context.tolist()) == seen

@@ -213,7 +213,7 @@ def test_collect(context, maps):
     if context is None:
         assert plans.context is None
     elif context == "plan":
-        assert torch.equal(plans.context, state % 20)
+        assert torch.equal(plans.context, (state % 20)[:, None].expand(30, 3))
     else:
         now, observed = state, []
         for t in range(3):

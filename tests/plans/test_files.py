@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import Plans
-from neuroprior.plans import is_per_step, read_plans, write_plans
+from neuroprior.plans import read_plans, write_plans
 from neuroprior.plans.columns import is_missing, number_in
 
 NAMES = st.text(st.characters(codec="utf-8"), min_size=1, max_size=6)
@@ -125,9 +125,6 @@ def test_csv_holds_actions_contexts_and_groups(tmp_path_factory, suffix, layout,
     path = tmp_path_factory.mktemp("files") / f"plans{suffix}"
     write_plans(plans, path, layout=layout)
     back = read_plans(path, num_actions=plans.num_actions, action_names=plans.action_names)
-    by_step = layout == "step" or plans.durations is not None
-    if by_step and plans.context is not None and not is_per_step(plans.context):
-        plans, back = (replace(p, context=None, context_names=None) for p in (plans, back))
     assert_same(back, plans, numbering=False)
 
 

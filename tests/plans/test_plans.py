@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import Plans
+from neuroprior.plans import expand_context
 from tests.support.sources import FALSE_ALARM, p_value, refuses, seeded
 
 ACTIONS = torch.tensor([[0, 1, 2], [2, 2, 0], [1, 0, 1], [0, 0, 0]])
@@ -51,7 +52,7 @@ def test_indexing_takes_everything_along(context, index):
     assert torch.equal(plans.lengths, lengths[index])
     assert torch.equal(plans.group, group[index])
     assert plans.action_names == ("a", "b", "c")
-    assert (plans.context is None) if context is None else torch.equal(plans.context, context[index])
+    assert (plans.context is None) if context is None else torch.equal(plans.context, expand_context(context, 3)[index])
 
 
 GOOD = {"actions": ACTIONS, "num_actions": 3}
@@ -105,10 +106,10 @@ def test_split_keeps_groups_together(group, share, seed):
     for part, same in zip(parts, again, strict=True):
         assert torch.equal(part.actions, same.actions)
         assert len(part) > 0
-        assert torch.equal(part.context, part.actions[:, 0].long())
+        assert torch.equal(part.context, part.actions.long())
     training, validation = parts
     assert not set(training.group.tolist()) & set(validation.group.tolist())
-    assert sorted(training.context.tolist() + validation.context.tolist()) == number.tolist()
+    assert sorted(training.context[:, 0].tolist() + validation.context[:, 0].tolist()) == number.tolist()
     held_out = len(set(validation.group.tolist()))
     assert abs(held_out - share * len(set(group))) <= 1
 
@@ -235,7 +236,7 @@ def test_steps_of_plans() -> None:
     assert plans.steps(7).lengths.tolist() == [0, 0, 0]
     assert plans.steps().actions.equal(plans.actions)
     once = Plans(plans.actions, 4, context=torch.tensor([5, 6, 7])).steps(2)
-    assert once.context.tolist() == [5, 6, 7]
+    assert once.context.tolist() == [[5, 5], [6, 6], [7, 7]]
     with pytest.raises(ValueError, match="first: an integer of at least 0"):
         plans.steps(-1)
     with pytest.raises(ValueError, match="stop: at least 3"):

@@ -37,10 +37,10 @@ def draw_context(takes, num, length, seed=0):
     arguments, per = CONTEXTS[takes]
     if per is None:
         return None
-    shape = (num,) if per == "plan" else (num, length)
+    drawn = 1 if per == "plan" else length  # that of a plan is the same at each step
     if "num_contexts" in arguments:
-        return torch.randint(C, shape, generator=seeded(seed))
-    return torch.randn(*shape, 2, generator=seeded(seed))
+        return torch.randint(C, (num, drawn), generator=seeded(seed)).expand(num, length)
+    return torch.randn(num, drawn, 2, generator=seeded(seed)).expand(num, length, 2)
 
 
 def make(kind, takes, window=None, seed=0, **extra):
@@ -59,11 +59,10 @@ def make(kind, takes, window=None, seed=0, **extra):
 
 def steps(prior, plans, context, per, explicit=False):
     """Logits `[N, L, A]` and the states before each action, by stepping; `explicit` repeats a plan's context."""
-    per_step = per == "step"
-    logits, state = prior.start(len(plans), context[:, 0] if per_step else context)
+    logits, state = prior.start(len(plans), None if context is None else context[:, 0])
     out, states = [logits], [state]
     for t in range(plans.shape[1] - 1):
-        current = context[:, t + 1] if per_step else context if explicit else None
+        current = context[:, t + 1] if per == "step" or (explicit and context is not None) else None
         logits, state = prior.step(plans[:, t], state, current)
         out.append(logits)
         states.append(state)
@@ -173,13 +172,13 @@ def test_window(kind, takes, window):
     if kind == "gru":
         prior.gru.weight_hh_l0.zero_()
         prior.gru.bias_ih_l0[8:16] = -100  # the update gate keeps nothing
-    plans, context, per = torch.randint(A, (20, L), generator=seeded(3)), draw_context(takes, 20, L), CONTEXTS[takes][1]
-    if context is not None and per == "step" and kind == "transformer" and window:
-        context[:] = context[:, :1]  # the start symbol keeps the context that it came with
+    plans, context = torch.randint(A, (20, L), generator=seeded(3)), draw_context(takes, 20, L)
+    if context is not None and kind == "transformer" and window:
+        context = context[:, :1].expand_as(context)  # the start symbol keeps the context that it came with
     forward = prior(plans, context)
     for t in range(window, L):
         last = slice(t - window, t + 1)
-        opening = prior(plans[:, last], context[:, last] if per == "step" else context)
+        opening = prior(plans[:, last], None if context is None else context[:, last])
         torch.testing.assert_close(forward[:, t], opening[:, window], rtol=1e-4, atol=1e-5)
     for age in range(1, L):
         changed = plans.clone()
@@ -196,7 +195,7 @@ def test_the_context_counts_from_its_step_on(kind, takes):
     forward = prior(plans, context)
     for t in [4] if per == "step" else [0]:
         changed = context.clone()
-        here = changed[:, t] if per == "step" else changed
+        here = changed[:, t] if per == "step" else changed[:]
         here.copy_((here + 1) % C)
         other = prior(plans, changed)
         torch.testing.assert_close(other[:, :t], forward[:, :t])
@@ -236,7 +235,7 @@ BAD_CONTEXTS = [
     ("index a step", torch.tensor([[0, 1]] * 3 + [[C, 0]]), str(C)),
     ("index a step", torch.zeros(4, 1).long(), "context"),
     ("features a plan", None, "context"),
-    ("features a plan", torch.zeros(4, 3), "[4, 3]"),
+    ("features a plan", torch.zeros(4, 3), "3]"),
     ("features a plan", torch.zeros(4).long(), "context"),
     ("features a plan", torch.tensor([[0, 1], [0, 1], [0, float("nan")], [0, 1]]), "nan"),
     ("features a step", torch.zeros(4, 2, 3), "[4, 2, 3]"),

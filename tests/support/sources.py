@@ -12,6 +12,7 @@ from scipy import stats
 from torch import Tensor
 
 from neuroprior import Prior, TabularWorld
+from neuroprior.plans import expand_context
 
 # On tensors this small several threads only wait for each other, for seconds on a busy machine.
 torch.set_num_threads(1)
@@ -166,7 +167,7 @@ def distribution(prior: Prior, length: int, context: Tensor | None = None, tempe
     """`[A**L]`: the probability of every plan, from `forward`; `context` is that of one plan, without a batch."""
     plans = every_plan(prior.num_actions, length)
     if context is not None:
-        context = context.expand(len(plans), *context.shape)
+        context = expand_context(context.expand(len(plans), *context.shape), length)
     with torch.no_grad():
         log_probs = (prior(plans, context).double() / temperature).log_softmax(-1)
     return log_probs.gather(-1, plans[..., None])[..., 0].sum(-1).exp()

@@ -70,7 +70,3 @@ def test_other_plans_are_refused_by_the_trainer_itself():
     plans, other = some(0), Plans(torch.zeros(4, 3, dtype=torch.long), 2)
     with refuses("validation: 3 actions are expected, not 2"):
         train(GRUPrior(A, 8), plans, Settings(validation=other, progress=False), 0)
-    prior = GRUPrior(A, 8, num_contexts=2)
-    once, each = (Plans(plans.actions, A, context=torch.zeros(shape, dtype=torch.long)) for shape in (30, (30, 6)))
-    with refuses("a context per step, or one a plan"):
-        prior.fit(once, validation=each, max_steps=2, progress=False)

@@ -10,7 +10,7 @@ from torch import Tensor
 from neuroprior._checks import check_count, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.behaviour.analysis.comparison import Score, action_bits, unit_name, units
-from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS
 from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors import Prior
@@ -215,7 +215,7 @@ def pieces(plans: Plans, length: int, most: int, generator: torch.Generator | No
     step = start[:, None] + torch.arange(length, device=device)
     context = plans.context
     if context is not None:
-        context = context[plan[:, None], step] if is_per_step(context) else context[plan]
+        context = context[plan[:, None], step]
     grouped = plans.group is not None and unit_name(plans, start_here) == "groups"
     return replace(
         plans,

@@ -13,7 +13,7 @@ from torch import Tensor
 from neuroprior._checks import as_list, check_sizes
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.behaviour.analysis.comparison import Score, action_bits, score_bits
-from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans import Plans, constant_context
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, num_units
 from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors import SwitchingPrior
@@ -302,8 +302,7 @@ def mode_frame(prior: SwitchingPrior, plans: Plans) -> Any:
     columns: dict[str, Any] = {"step": step}
     context = plans.context
     if context is not None and "num_contexts" in context_arguments(plans):
-        each = context if is_per_step(context) else context[:, None].expand(plans.actions.shape)
-        columns["context"] = named(plans.context_names, each[mask].long())
+        columns["context"] = named(plans.context_names, context[mask].long())
     columns["action"] = named(plans.action_names, plans.actions[mask].long())
     columns["mode"] = found.path.cpu()[mask].numpy() + 1
     for what, values in (("filtered", found.filtered), ("smoothed", found.smoothed)):
@@ -348,7 +347,8 @@ def mode_table(prior: SwitchingPrior, plans: Plans) -> Any:
     changed = (path[:, 1:] != path[:, :-1]) & mask[:, 1:]
     context = plans.context
     places = None
-    if context is not None and is_per_step(context) and "num_contexts" in context_arguments(plans):
+    varies = context is not None and constant_context(plans) is None
+    if context is not None and varies and "num_contexts" in context_arguments(plans):
         places = plans.context_names or tuple(map(str, range(int(context.max()) + 1)))
     rows = []
     for k, dwell in enumerate(_runs(path, mask, prior.num_modes)):

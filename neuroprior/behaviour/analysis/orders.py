@@ -8,7 +8,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_count, check_range, is_integer
 from neuroprior.behaviour.analysis.flat import FlatPlans, ranks
-from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans import Plans
 
 
 @dataclass(frozen=True)
@@ -103,4 +103,4 @@ def _context(plans: Plans, flat: FlatPlans, num_contexts: int) -> Tensor:
         found = "none" if plans.context is None else str(plans.context.dtype).removeprefix("torch.")
         raise ValueError(f"context: indices below {num_contexts} are expected, not {found}")
     check_range("context", plans.context, num_contexts, "contexts")
-    return plans.context.flatten()[flat.place if is_per_step(plans.context) else flat.plan].long()
+    return plans.context.flatten()[flat.place].long()

@@ -14,7 +14,7 @@ from neuroprior._version import __version__
 from neuroprior.behaviour.analysis.calibration import Reliability, reliability
 from neuroprior.behaviour.analysis.comparison import Score, action_bits, baselines, score_bits, units
 from neuroprior.behaviour.analysis.lags import pieces
-from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans import Plans, constant_context
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, fair_split, folds, num_units
 from neuroprior.plans.past_durations import PastDurations
 from neuroprior.priors import CombinedPrior, GRUPrior, MarkovPrior, Prior, StackedPrior, TransformerPrior
@@ -248,7 +248,7 @@ def _of_last(prior: Prior, held_out: Plans, known: int) -> Score:
 def _world(learned: Plans, num_contexts: int) -> TabularWorld | None:
     """How the context of a step follows from the one before and the action there, where these alone decide it."""
     context, actions = learned.context, learned.num_actions
-    if context is None or context.is_floating_point() or not is_per_step(context):
+    if context is None or context.is_floating_point() or constant_context(learned) is not None:
         return None
     goes_on = learned.mask()[:, 1:]
     pair = (context.long() * actions + learned.actions.long())[:, :-1][goes_on]
@@ -270,8 +270,9 @@ def _generated(prior: Prior, scored: Plans, world: TabularWorld | None, seed: in
     if not prior.takes_context:
         return sample(prior, len(like), like.max_length, generator=generator)
     assert like.context is not None
-    if not is_per_step(like.context):
-        return sample(prior, len(like), like.max_length, like.context, generator=generator)
+    once = constant_context(like)
+    if once is not None:
+        return sample(prior, len(like), like.max_length, once, generator=generator)
     if world is None or like.max_length == 0:
         return None
     return sample_in_world(prior, world, like.context[:, 0].long(), 1, like.max_length, generator=generator)[0][:, 0]

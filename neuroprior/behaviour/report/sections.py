@@ -26,7 +26,7 @@ from neuroprior.behaviour.report.modes import mode_section
 from neuroprior.behaviour.report.page import FigureBox, Section, Table
 from neuroprior.behaviour.report.part import LISTED, SIGNIFICANT, Part, action_names, group_names, p_text
 from neuroprior.behaviour.report.scores import Evaluation, Model
-from neuroprior.plans import Plans, has_patterns, is_per_step
+from neuroprior.plans import Plans, constant_context, has_patterns
 from neuroprior.plans.columns import never_occur
 from neuroprior.priors import learn_macros
 
@@ -98,7 +98,7 @@ def describe(plans: Plans) -> dict[str, Any]:
     if plans.context is not None:
         kind = "features" if plans.context.is_floating_point() else f"{_num_contexts(plans)} contexts"
         kind = "patterns" if has_patterns(plans.context) else kind
-        context = f"{kind}, {'at each step' if is_per_step(plans.context) else 'once a plan'}"
+        context = f"{kind}, {'at each step' if constant_context(plans) is None else 'once a plan'}"
     return {
         "plans": len(plans),
         "actions": int(lengths.sum()),

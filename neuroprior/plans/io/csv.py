@@ -28,7 +28,7 @@ from neuroprior.plans.columns import (
 from neuroprior.plans.io.assembly import assembled
 from neuroprior.plans.plans import Plans
 from neuroprior.plans.rows import check_readable, rows_of
-from neuroprior.plans.sequences import is_per_step
+from neuroprior.plans.sequences import constant_context
 
 ROWS_AT_ONCE = 2**10
 """Rows that are parsed together; a few times faster than blocks that exceed the processor's cache."""
@@ -386,7 +386,8 @@ def write_csv(plans: Plans, path: Path, layout: str | None) -> None:
         raise ValueError(f"layout: 'plan', 'step' or None is expected, not {layout!r}")
     check_readable(plans, str(path), "CSV")
     lengths = plans.mask().sum(1)
-    per_step = is_per_step(plans.context) or plans.durations is not None
+    varies = plans.context is not None and constant_context(plans) is None
+    per_step = varies or plans.durations is not None
     by_step = layout == "step" or (layout is None and per_step)
     if per_step and not by_step:
         raise ValueError(
@@ -398,4 +399,4 @@ def write_csv(plans: Plans, path: Path, layout: str | None) -> None:
         )
     with written_whole(path) as file:
         writer = csv.writer(file, delimiter="\t" if path.suffix.lower() == ".tsv" else ",", lineterminator="\n")
-        writer.writerows(rows_of(plans, by_step, is_per_step(plans.context)))
+        writer.writerows(rows_of(plans, by_step))

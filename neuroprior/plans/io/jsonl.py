@@ -32,7 +32,7 @@ from neuroprior.plans.columns import (
 )
 from neuroprior.plans.io.assembly import assembled, renamed
 from neuroprior.plans.plans import Plans
-from neuroprior.plans.sequences import is_per_step
+from neuroprior.plans.sequences import constant_context
 
 HEADER = ("num_actions", "action_names", "context_names", "group_names", "condition_names", "end")
 
@@ -78,13 +78,15 @@ def read_jsonl(path: Path, num_actions: int | None, action_names: Names | None) 
 def write_jsonl(plans: Plans, path: Path) -> None:
     """Write a JSONL file; its first line holds what the others do not: `num_actions`, names, `end`."""
     header = {key: getattr(plans, key) for key in HEADER if getattr(plans, key) is not None}
+    once = constant_context(plans)  # a context that never changes is written once a plan
     with written_whole(path) as file:
         file.write(json.dumps(header, ensure_ascii=False) + "\n")
         for start in range(0, len(plans), 2**14):
             some = plans[start : start + 2**14]
             columns = {"actions": named(some.actions.tolist(), plans.action_names)}
             if some.context is not None:
-                columns["context"] = named(some.context.tolist(), plans.context_names)
+                context = some.context if once is None else once[start : start + 2**14]
+                columns["context"] = named(context.tolist(), plans.context_names)
             for what in OF_PLANS:
                 values = getattr(some, what)
                 if values is not None:
@@ -96,7 +98,7 @@ def write_jsonl(plans: Plans, path: Path) -> None:
                 columns["durations"] = [[None if time != time else time for time in times] for times in known]
             for length, *values in zip(some.mask().sum(1).tolist(), *columns.values(), strict=True):
                 row = dict(zip(columns, values, strict=True))
-                for key in ("actions", "durations", *(["context"] if is_per_step(plans.context) else [])):
+                for key in ("actions", "durations", *(["context"] if once is None else [])):
                     if key in row:
                         row[key] = row[key][:length]
                 file.write(json.dumps(row, ensure_ascii=False) + "\n")

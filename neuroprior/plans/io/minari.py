@@ -13,7 +13,6 @@ import torch
 
 from neuroprior.plans.io.trajectories import from_trajectories, to_trajectories
 from neuroprior.plans.plans import Plans, check_are_plans
-from neuroprior.plans.sequences import is_per_step
 
 OURS = "neuroprior"
 """Key of a dataset's metadata under which stands what Minari has no place for."""
@@ -123,20 +122,16 @@ def write_minari(plans: Plans, dataset_id: str) -> None:
         if plans.group is not None:
             dataset.storage.update_episode_metadata([{"group": group} for group in plans.group.tolist()])
         names = {key: getattr(plans, key) for key in ("action_names", "context_names", "group_names", "end")}
-        ours = {key: value for key, value in names.items() if value is not None} | {"context": _kind(plans)}
+        ours = {key: value for key, value in names.items() if value is not None} | {
+            "context": plans.context is not None
+        }
         dataset.storage.update_metadata({OURS: json.dumps(ours)})
-
-
-def _kind(plans: Plans) -> str | None:
-    return None if plans.context is None else "step" if is_per_step(plans.context) else "plan"
 
 
 def _context_of_steps(plans: Plans) -> tuple[torch.Tensor, Any]:
     """The context of each step, and Gymnasium's space of it."""
     spaces = _module("gymnasium.spaces")
     context = torch.zeros(plans.actions.shape, dtype=torch.long) if plans.context is None else plans.context
-    if plans.context is not None and not is_per_step(plans.context):
-        context = plans.context[:, None].expand(-1, plans.max_length, *plans.context.shape[1:])
     if context.is_floating_point():
         context = context.float()
         return context, spaces.Box(-np.inf, np.inf, (context.shape[-1],), np.float32)
@@ -147,10 +142,8 @@ def _context_of_steps(plans: Plans) -> tuple[torch.Tensor, Any]:
 
 
 def _restored(plans: Plans, groups: list[Any], ours: dict[str, Any], observations: bool) -> Plans:
-    """Plans as they were written: with names, groups and `end`, and a context per plan where it was one."""
-    context = plans.context
-    if "context" in ours and ours["context"] != "step" and context is not None:
-        context = context[:, 0] if ours["context"] == "plan" else None
+    """Plans as they were written: with names, groups and `end`, and without a context where they had none."""
+    context = plans.context if ours.get("context", True) else None
     grouped = bool(groups) and all(group is not None for group in groups)
     lengths = plans.mask().sum(1) if ours.get("end") is not None else plans.lengths
     return Plans(

@@ -12,7 +12,6 @@ from neuroprior.plans.columns import LARGEST_INTEGER, Integers, check_names
 from neuroprior.plans.io.assembly import assembled
 from neuroprior.plans.io.npz import as_array
 from neuroprior.plans.plans import Plans
-from neuroprior.plans.sequences import is_per_step
 
 
 def from_trajectories(trajectories: Iterable[Any], num_actions: int, *, observations: str | None = "context") -> Plans:
@@ -64,12 +63,12 @@ def to_trajectories(plans: Plans, kind: Literal["dicts", "imitation"] = "dicts")
 
     Args:
         plans: N of them.
-        kind: "dicts" of `actions [T]`, int64, and, of a context per step, `observations [T]` or `[T, C]`; or those of
+        kind: "dicts" of `actions [T]`, int64, and, of a context, `observations [T]` or `[T, C]`; or those of
             the package "imitation", `imitation.data.types.Trajectory`, whose observations `[T + 1]` or `[T + 1, C]` are
-            the context per step, the last one repeated, and each of which is terminal.
+            the context, the last one repeated, and each of which is terminal.
 
     Raises:
-        ValueError: another kind; or, for imitation, plans without a context per step, or one without actions.
+        ValueError: another kind; or, for imitation, plans without a context, or one without actions.
         ImportError: imitation is asked for, and not installed.
 
     Example:
@@ -79,7 +78,7 @@ def to_trajectories(plans: Plans, kind: Literal["dicts", "imitation"] = "dicts")
     if kind not in ("dicts", "imitation"):
         raise ValueError(f"kind: 'dicts' or 'imitation' is expected, not {kind!r}")
     actions, lengths = plans.actions.long().cpu().numpy(), plans.mask().sum(1).tolist()
-    context = plans.context if is_per_step(plans.context) else None
+    context = plans.context
     found = [{"actions": row[:length].copy()} for row, length in zip(actions, lengths, strict=True)]
     if context is not None:
         for trajectory, row, length in zip(found, context.detach().cpu().numpy(), lengths, strict=True):
@@ -87,7 +86,7 @@ def to_trajectories(plans: Plans, kind: Literal["dicts", "imitation"] = "dicts")
     if kind == "dicts":
         return found
     if context is None:
-        raise ValueError("plans: no context per step; imitation's trajectories need an observation for each step")
+        raise ValueError("plans: no context; imitation's trajectories need an observation for each step")
     if lengths and not min(lengths):
         raise ValueError(f"plans: plan {lengths.index(0)} has no actions; imitation's trajectories need some")
     made = import_module("imitation.data.types").Trajectory

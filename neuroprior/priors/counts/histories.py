@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from neuroprior._threads import share
-from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans import Plans
 
 ACTIONS_AT_ONCE = 2**18
 """Actions that are counted together; small enough for a processor's cache."""
@@ -154,7 +154,7 @@ def count_histories(
             here = part.mask()[:, : actions.shape[1]].to(device)
         if num_contexts is not None and part.context is not None:
             context = part.context.to(device).long()
-            context = context[:, : actions.shape[1]] if is_per_step(context) else context[:, None].expand_as(actions)
+            context = context[:, : actions.shape[1]]
         histories.add(actions, None, here, context)
     return histories.finish(openings)
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from neuroprior._random import draw_seed
 from neuroprior._threads import share
-from neuroprior.plans import Plans, action_dtype, is_per_step
+from neuroprior.plans import Plans, action_dtype
 from neuroprior.priors.counts.histories import MAX_TABLE_BYTES, Counts, Tree, count_histories
 from neuroprior.priors.prior import Prior
 
@@ -113,9 +113,7 @@ class HistoryPrior(Prior):
     def _places(self, plans: Tensor, context: Tensor | None) -> tuple[Tensor, Tensor]:
         """Of each action of `plans [N, L]` the row of `log_probs` that holds for it, and the context: `[N, L]` each."""
         node = self._nodes(plans.long())
-        each = torch.zeros_like(node)
-        if context is not None:
-            each = context.long() if is_per_step(context) else context.long()[:, None].expand(plans.shape)
+        each = torch.zeros_like(node) if context is None else context.long()
         return self._row(node.flatten(), each.flatten()).view(plans.shape), each
 
     def entries(self, plans: Plans) -> Tensor:

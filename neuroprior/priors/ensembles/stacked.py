@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from neuroprior._checks import check_memory, check_sizes
 from neuroprior._random import draw_seed, generator_on
-from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans import Plans
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, in_parts, num_units
 from neuroprior.priors.counts import ContextTreePrior, HistoryPrior, MarkovPrior
 from neuroprior.priors.neural.gru import gru_sequence
@@ -133,7 +133,6 @@ class StackedPrior(Prior):
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         if plans.shape[1] == 0:
             return torch.zeros(*plans.shape, self.num_actions, device=self.device)
-        context = self._each_step(plans, context)
         with torch.no_grad():
             forecasts = torch.stack([e(plans, context_for(e, context)) for e in self._experts()], 2)
         logits: Tensor = self.mixer(plans, self._all_features(forecasts, plans, context))
@@ -183,7 +182,7 @@ class StackedPrior(Prior):
 
     def _stacked(self, plans: Plans, forecasts: Tensor) -> Plans:
         """The plans as the network reads them, from forecasts `[N, L, E, A]` of their actions."""
-        features = self._all_features(forecasts, plans.actions, self._each_step(plans.actions, plans.context))
+        features = self._all_features(forecasts, plans.actions, plans.context)
         return replace(plans, context=features, context_names=None)
 
     def recount(self, plans: Plans) -> Self:
@@ -213,12 +212,6 @@ class StackedPrior(Prior):
         for expert in self.experts:
             assert isinstance(expert, HistoryPrior)
             yield expert
-
-    def _each_step(self, plans: Tensor, context: Tensor | None) -> Tensor | None:
-        """The context before each action, `[N, L]`."""
-        if context is None or is_per_step(context):
-            return context
-        return context[:, None].expand(plans.shape)
 
     def _features(self, forecasts: Tensor, ago: Tensor, context: Tensor | None) -> Tensor:
         """The network's features `[N, D]`, from forecasts `[N, E, A]`."""

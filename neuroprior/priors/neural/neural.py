@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from neuroprior._checks import check_count, check_memory, check_seed, check_sizes, is_number
 from neuroprior._random import draw_seed, generator_on
-from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans import Plans
 from neuroprior.plans.folds import check_alike
 from neuroprior.priors.neural import cuda_graphs as recordings
 from neuroprior.priors.neural.features import Standardise
@@ -287,7 +287,7 @@ class NeuralPrior(Prior):
 
         Args:
             plans: integers `[N, L]`, L > 0.
-            context: None, one a plan or one a step.
+            context: None, or one a step.
             previous: integers `[N]`: the action before the first (A for none); None: there is none.
             hidden: as the last call returned it; None: nothing was read before.
 
@@ -298,12 +298,9 @@ class NeuralPrior(Prior):
 
     def _sequence(self, plans: Tensor, context: Tensor | None, previous: Tensor | None) -> Tensor:
         """The inputs `[N, L, D]` that come before each action of `plans [N, L]`."""
-        num, length = plans.shape
         shifted = nn.functional.pad(plans.long(), (1, 0), value=self.num_actions)[:, :-1]
         if previous is not None:
             shifted = torch.cat([previous[:, None].long(), shifted[:, 1:]], 1)
-        if context is not None and not is_per_step(context):
-            context = context[:, None].expand(num, length, *context.shape[1:])
         return self._inputs(shifted, context, None)
 
     @property

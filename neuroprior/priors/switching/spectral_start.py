@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans import Plans
 
 RARE = 3.0
 """Added to the standard deviations of a row, in actions: so histories that occurred a few times weigh little."""
@@ -38,7 +38,7 @@ def spectral_modes(plans: Plans, num_modes: int, length: float, generator: torch
     rows = torch.nn.functional.pad(taken, (1, 0), value=size)[:, :-1]
     if plans.context is not None:
         context = plans.context.cpu().long()
-        rows = rows + (size + 1) * (context if is_per_step(context) else context[:, None])
+        rows = rows + (size + 1) * context
     rows, actions = rows[mask].unique(return_inverse=True)[1], taken[mask]
     number = int(rows.max()) + 1 if len(rows) else 0
     counts = torch.zeros(number * size, dtype=torch.double)

@@ -178,7 +178,7 @@ def test_pieces_keep_contexts_and_groups():
     plan, at = found.actions.long() // 10, found.actions.long() % 10
     assert found.context.equal(features[plan, at])
     found = pieces(numbered(context=torch.arange(5), group=torch.zeros(5).long(), group_names=["a"]), 3, 100)
-    assert found.context.equal(found.actions[:, 0].long() // 10)
+    assert found.context.equal(found.actions.long() // 10)
     assert found.group.tolist() == [0] * 3 + [1] * 5 + [2]  # the plan: one group is none
     assert found.group_names is None
 

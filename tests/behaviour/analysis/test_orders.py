@@ -122,5 +122,5 @@ def test_bad_input():
         order_selection(plans, 1, num_contexts=2)
     with refuses("context", "float32"):
         order_selection(Plans(plans.actions, 2, context=torch.zeros(3, 2)), 1, num_contexts=2)
-    with refuses("context[2]", "5"):
+    with refuses("context[2, 0]", "5"):
         order_selection(Plans(plans.actions, 2, context=torch.tensor([0, 1, 5])), 1, num_contexts=2)

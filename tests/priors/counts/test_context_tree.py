@@ -143,7 +143,6 @@ def problems(draw):
 
 def rows_of(plans, per):
     current = torch.zeros_like(plans.actions) if per is None else plans.context
-    current = current[:, None].expand_as(plans.actions) if per == "plan" else current
     lengths = plans.mask().sum(1).tolist()
     rows = [(plans.actions[i, :n].tolist(), current[i, :n].tolist()) for i, n in enumerate(lengths)]
     return rows if per else [(actions, [None] * len(actions)) for actions, _ in rows]
@@ -164,11 +163,12 @@ def test_every_tree(problem):
     test = torch.randint(num_actions, (num, length), generator=generator)
     context = None
     if contexts:
-        context = torch.randint(contexts, (num,) if per == "plan" else (num, length), generator=generator)
+        drawn = torch.randint(contexts, (num, 1 if per == "plan" else length), generator=generator)
+        context = drawn.expand(num, length)
     got = prior(test, context).double().exp()
     for i in range(num):
         for t in range(length):
-            current = None if context is None else int(context[i] if per == "plan" else context[i, t])
+            current = None if context is None else int(context[i, t])
             torch.testing.assert_close(got[i, t], truth.next(test[i, :t].tolist(), current), rtol=1e-6, atol=1e-7)
     best = truth.best()
     assert met(prior) in best

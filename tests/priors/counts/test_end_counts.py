@@ -129,6 +129,6 @@ def test_the_end_with_contexts():
     # each of 1,000 plans ends where it should with a probability of over 0.98; 940 is over 9 standard errors below
     for current, length in ((0, 1), (1, 3)):
         assert int((lengths[current::2] == length).sum()) > 940
-    ends = prior(torch.tensor([[0, 1, 0, 1]] * 2), torch.arange(2)).softmax(-1)[..., 2]
+    ends = prior(torch.tensor([[0, 1, 0, 1]] * 2), torch.arange(2)[:, None].expand(2, 4)).softmax(-1)[..., 2]
     assert float(ends[0, 1]) > 0.98
     assert float(ends[1, 3]) > 0.98

@@ -25,7 +25,8 @@ def some_plans(num_actions: int, kind: str, used: int | None = None, seed: int =
 def contexts(kind: str, num_contexts: int, num: int, length: int, seed: int) -> torch.Tensor | None:
     if kind == "none":
         return None
-    return torch.randint(num_contexts, (num,) if kind == "plan" else (num, length), generator=seeded(seed))
+    drawn = torch.randint(num_contexts, (num, 1 if kind == "plan" else length), generator=seeded(seed))
+    return drawn.expand(num, length)
 
 
 def fitted(make, depth: int, more: dict, kind: str, num_actions: int = 3) -> Prior:
@@ -57,7 +58,7 @@ def test_forward_is_stepping(name, kind):
     current = contexts(kind, 3, 3, longest, seed=depth + 2)
     want, edge = Prior.forward(prior, plans, current), CHUNK + depth
     for length in (0, 1, CHUNK, edge - 1, edge, edge + 1, 2 * edge - 1, 2 * edge, 2 * edge + 1, longest - 1, longest):
-        got = prior(plans[:, :length], current[:, :length] if kind == "step" else current)
+        got = prior(plans[:, :length], None if current is None else current[:, :length])
         assert got.shape == (3, length, 3)
         assert torch.equal(got, want[:, :length]), length
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from neuroprior import MarkovPrior, Plans, UniformPrior
+from neuroprior.plans import constant_context
 from tests.support.sources import (
     FALSE_ALARM,
     best_plan_distribution,
@@ -128,13 +129,13 @@ def problems(draw):
 def test_counts(problem):
     plans, contexts, per, arguments, seed = problem
     prior = MarkovPrior(**arguments, num_contexts=contexts or None).fit(plans)
-    assert prior.context_per == per
+    assert prior.context_per == (per and ("step" if constant_context(plans) is None else "plan"))
     rows = []
     for i in range(len(plans)):
         length = plans.max_length if plans.lengths is None else int(plans.lengths[i])
         current = [None] * length
         if contexts:
-            current = [int(plans.context[i])] * length if per == "plan" else plans.context[i, :length].tolist()
+            current = plans.context[i, :length].tolist()
         rows.append((plans.actions[i, :length].tolist(), current))
     truth = Counting(rows, contexts=contexts, **arguments)
     generator = seeded(seed + 1)
@@ -142,11 +143,12 @@ def test_counts(problem):
     test = torch.randint(arguments["num_actions"], (num, length), generator=generator)
     context = None
     if contexts:
-        context = torch.randint(contexts, (num,) if per == "plan" else (num, length), generator=generator)
+        drawn = torch.randint(contexts, (num, 1 if per == "plan" else length), generator=generator)
+        context = drawn.expand(num, length)
     got = prior(test, context).softmax(-1)
     for i in range(num):
         for t in range(length):
-            current = None if context is None else int(context[i] if per == "plan" else context[i, t])
+            current = None if context is None else int(context[i, t])
             want = torch.tensor(truth.next(test[i, :t].tolist(), current))
             torch.testing.assert_close(got[i, t], want, rtol=1e-4, atol=1e-6)
     assert (got > 0).all()

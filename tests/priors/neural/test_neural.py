@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from neuroprior import GRUPrior, Plans, TransformerPrior, load, save
+from neuroprior.plans import expand_context
 from neuroprior.priors.neural import gru
 from tests.support.sources import best_plan_distribution, best_plans, bits_per_action, every_plan, refuses, seeded
 
@@ -338,7 +339,8 @@ def test_single_steps_of_a_transformer_are_those_of_its_blocks(lags, window, spa
         if one is fast[0] or window is span is None:
             torch.testing.assert_close(one, other.detach(), atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(by_turns[0].detach(), fast[0], atol=1e-5, rtol=1e-4)
-    whole = prior(torch.cat([action, action[:1]]).T, current).detach().transpose(0, 1)
+    throughout = None if current is None else expand_context(current, len(action) + 1)
+    whole = prior(torch.cat([action, action[:1]]).T, throughout).detach().transpose(0, 1)
     torch.testing.assert_close(whole, fast[0], atol=1e-5, rtol=1e-4)
 
 
