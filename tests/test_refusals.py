@@ -183,8 +183,6 @@ def test_plans_that_are_numbered_otherwise_are_not_counted_in_again(make) -> Non
         prior.recount(named("cba"))
     with refuses("context_names", "R, L", "L, R"):
         prior.recount(named(contexts="RL"))
-    with refuses("one per plan is expected"):
-        prior.recount(named(per="step"))
     with refuses("3 actions are expected", "not 4"):
         prior.recount(named(end=True))
     with refuses("at least one with an action"):

@@ -128,7 +128,7 @@ class Plans(Sequences):
         if self.context is not None:
             context = _tensor("context", self.context)
             check_context(context, num, length)
-            context = context.to(torch.int32) if has_patterns(context) else expand_context(context, length)
+            context = context.to(torch.int32) if has_patterns(context) else self._context_of_steps(context)
             object.__setattr__(self, "context", context)
         for what in ("action", "context", "group", "condition"):
             if _check_texts(f"{what}_names", getattr(self, f"{what}_names")):
@@ -140,6 +140,14 @@ class Plans(Sequences):
         _check_names("group", self.group, self.group_names)
         _check_names("condition", self.condition, self.condition_names)
         _check_names("context", self.context, self.context_names)
+
+    def _context_of_steps(self, context: Tensor) -> Tensor:
+        """The context before each step; beyond a plan's length it is 0."""
+        context = expand_context(context, self.max_length)
+        if self.lengths is None:
+            return context
+        beyond = ~self.mask()
+        return context.masked_fill(beyond if context.dim() == 2 else beyond[..., None], 0)
 
     def _check_end(self, actions: Tensor) -> None:
         """Check that `end` only closes plans; where lengths are not given, take them from it."""

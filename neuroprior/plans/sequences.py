@@ -150,7 +150,7 @@ def is_per_plan(context: Tensor) -> bool:
 
 
 def expand_context(context: Tensor, length: int) -> Tensor:
-    """Returns the context before each step, `[N, L]` or `[N, L, C]`; one that is given once a plan holds throughout.
+    """Returns a `context` before each of `length` steps, `[N, L]` or `[N, L, C]`; one given once a plan is repeated.
 
     Example:
         >>> expand_context(torch.tensor([5, 3]), 2).tolist()

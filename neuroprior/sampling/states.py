@@ -25,7 +25,7 @@ def map_state(function: Callable[..., Tensor], *states: State) -> State:
 
 
 def select_rows(state: State, row: Tensor | slice) -> State:
-    """Returns the rows `row` (integers `[M]`, or a slice) of a state of N plans.
+    """Returns the rows `row` (integers `[M]`, or a slice) of the `state` of N plans.
 
     Example:
         >>> select_rows((torch.tensor([1, 2, 3]), torch.tensor([[4], [5], [6]])), torch.tensor([2, 0]))

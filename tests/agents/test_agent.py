@@ -225,7 +225,7 @@ def test_it_stores_what_it_observed(per):
     start = one.state
     done = one.run(24)
     cells = torch.cat([start[:, None], done.states[:, :-1]], 1)[..., 0].view(5, 4, 6).transpose(0, 1).flatten(0, 1)
-    assert torch.equal(one.replay.plans.context, cells if per == "step" else cells[:, 0])
+    assert torch.equal(one.replay.plans.context, cells if per == "step" else cells[:, :1].expand_as(cells))
     assert prior.context_per == per
 
 
@@ -318,7 +318,7 @@ def test_what_a_prior_has_learned_beside_its_weights_is_restored(tmp_path):
     again = restore_agent(agent(MarkovPrior(4, 1, num_contexts=36), retention=1.0), tmp_path)
     assert again.prior.learned == first.learned
     assert torch.equal(again.run(12).actions, one.run(12).actions)
-    assert again.replay.plans.context.shape == (20,)
+    assert again.replay.plans.context.shape == (20, 6)
 
 
 def test_networks_are_trained_from_its_generator():

@@ -37,8 +37,7 @@ def in_contexts(num_plans: int = 60, seed: int = 0, kind: str = "plan", contexts
     """Plans whose first actions, or all of them, say what the context is."""
     shape = (num_plans,) if kind == "plan" else (num_plans, 6)
     plans = some_plans(num_plans, seed, context=torch.randint(contexts, shape, generator=seeded(seed + 3)))
-    context = plans.context if kind == "step" else plans.context[:, None]
-    actions = (plans.actions.long() // 2 + context) % 3
+    actions = (plans.actions.long() // 2 + plans.context) % 3
     return replace(plans, actions=actions, context_names=CONTEXTS[:contexts])
 
 

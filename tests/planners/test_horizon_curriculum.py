@@ -192,8 +192,6 @@ def test_in_a_stochastic_world_a_plan_is_executed_once():
     assert not bool((plans.mask() & (plans.context == 5)).any())
     shorter = plans.mask().sum(1) < 12
     assert 0 < int(shorter.sum()) < 400
-    beyond = plans.context.gather(1, plans.mask().sum(1).clamp(max=11)[:, None])[:, 0]
-    assert bool((beyond[shorter] == 5).all())
 
 
 def test_in_a_stochastic_world_plans_are_scored_by_several_rollouts():

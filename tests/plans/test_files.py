@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import Plans
-from neuroprior.plans import read_plans, write_plans
+from neuroprior.plans import expand_context, read_plans, write_plans
 from neuroprior.plans.columns import is_missing, number_in
 
 NAMES = st.text(st.characters(codec="utf-8"), min_size=1, max_size=6)
@@ -140,7 +140,7 @@ def test_csv_holds_plans_without_actions_beside_others(tmp_path):
         (torch.tensor([3, 1]), None, ["action_1", "action_2", "context"]),
         (torch.tensor([[3, 1], [0, 0]]), None, ["plan", "action", "context"]),
         (torch.tensor([[0.5, 1], [2, 3]]), None, ["action_1", "action_2", "context_1", "context_2"]),
-        (torch.ones(2, 2, 1), None, ["plan", "action", "context_1"]),
+        (torch.eye(2)[..., None], None, ["plan", "action", "context_1"]),
         (None, None, ["action_1", "action_2"]),
         (None, "step", ["plan", "action"]),
     ],
@@ -151,7 +151,7 @@ def test_the_layout_of_csv_follows_the_context(tmp_path, context, layout, column
     assert path.read_text().splitlines()[0].split(",") == columns
     back = read_plans(path)
     assert back.actions.tolist() == [[0, 1], [1, 1]]
-    assert context is None or torch.equal(back.context, context)
+    assert context is None or torch.equal(back.context, expand_context(context, 2))
 
 
 def test_a_context_per_plan_is_repeated_on_its_steps(tmp_path):
@@ -194,13 +194,17 @@ def test_jsonl_by_hand(tmp_path):
 def test_jsonl_context_is_of_the_kind_of_the_whole_file(tmp_path, contexts, expected):
     lines = [f'{{"actions": [0, 1], "context": {context}}}' for context in contexts]
     back = read_text(tmp_path, "a.jsonl", "\n".join(lines)).context
-    assert (back is None and expected is None) or (torch.equal(back, expected) and back.dtype == expected.dtype)
+    if expected is None:
+        assert back is None
+    else:
+        assert torch.equal(back, expand_context(expected, 2))
+        assert back.dtype == expected.dtype
 
 
 def test_a_decimal_point_may_come_in_a_later_plan(tmp_path):
     lines = ['{"actions": [0, 1], "context": [1, 2]}'] * 20 + ['{"actions": [0, 1], "context": [1, 2.5]}'] * 20
     plans = read_text(tmp_path, "a.jsonl", "\n".join(lines))
-    assert plans.context.tolist() == [[1, 2]] * 20 + [[1, 2.5]] * 20
+    assert plans.context.tolist() == [[[1, 2]] * 2] * 20 + [[[1, 2.5]] * 2] * 20
 
 
 @pytest.mark.parametrize(
@@ -461,7 +465,7 @@ def test_as_many_features_of_a_plan_as_it_has_actions_are_noted(name, tmp_path):
     def read(context):
         write_plans(Plans(actions, 2, context=context), tmp_path / name)
         found = read_plans(tmp_path / name, num_actions=2)
-        assert found.context.shape == context.shape
+        assert found.context.shape == expand_context(context, 3).shape
         return found.notes
 
     (note,) = read(features)

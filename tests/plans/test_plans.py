@@ -52,7 +52,11 @@ def test_indexing_takes_everything_along(context, index):
     assert torch.equal(plans.lengths, lengths[index])
     assert torch.equal(plans.group, group[index])
     assert plans.action_names == ("a", "b", "c")
-    assert (plans.context is None) if context is None else torch.equal(plans.context, expand_context(context, 3)[index])
+    assert (
+        plans.context is None
+        if context is None
+        else torch.equal(plans.context[plans.mask()], expand_context(context, 3)[index][plans.mask()])
+    )
 
 
 GOOD = {"actions": ACTIONS, "num_actions": 3}
@@ -229,7 +233,7 @@ def test_steps_of_plans() -> None:
     cut = plans.steps(1, 3)
     assert cut.lengths.tolist() == [2, 1, 0]
     assert cut.actions.tolist() == [[1, 2], [2, 0], [0, 0]]
-    assert cut.context.tolist() == [[1, 2], [5, 6], [9, 10]]
+    assert cut.context.tolist() == [[1, 2], [5, 0], [0, 0]]
     assert cut.durations.tolist() == [[1, 2], [5, 0], [0, 0]]
     assert cut.group.tolist() == [0, 0, 1]
     assert plans.steps(7).max_length == 0

@@ -315,7 +315,7 @@ def test_plans_of_no_actions_are_collected() -> None:
     plans = collect(LevinPlanner(UniformPrior(9)), turned, state=start, context="plan")
     assert plans.actions.shape == (2, 0)
     assert plans.context is not None
-    assert plans.context.equal(turned.observe(start))
+    assert plans.context.shape == (2, 0, turned.observe(start).shape[1])
 
 
 def search_tiles(prior: Any = None, **settings: Any) -> Search:

@@ -237,7 +237,7 @@ class Unsavable(Broken):
         (WrongSamples, "do not fit log_prob"),
         (GlobalRandomness, "same seed gave other plans|global generator"),
         (partial(Forgetful, bonus=1.0), "saved, loaded"),
-        (ReadsContext, "step: .* `start` is given it, and `step` None"),
+        (ReadsContext, "step: .* `step` is given None where the last context goes on"),
         (Unsavable, "cannot be saved and loaded"),
     ],
 )

@@ -14,7 +14,7 @@ from neuroprior._random import draw_seed, generator_on
 from neuroprior.control.priors.autoregressive import AutoregressivePrior
 from neuroprior.control.priors.compiled_sampling import draw_recurrent
 from neuroprior.control.priors.linear_gaussian import LinearTables, held_out_split
-from neuroprior.control.priors.vector_prior import GaussianForecast, VectorPrior, context_per_step
+from neuroprior.control.priors.vector_prior import GaussianForecast, VectorPrior
 from neuroprior.control.vector_plans import VectorPlans
 from neuroprior.plans.folds import check_alike
 from neuroprior.plans.sequences import Sequences
@@ -306,7 +306,7 @@ class VectorGRU(VectorPrior):
         if previous is not None:
             first = torch.where(previous[:, :1].isnan(), 0, self._entries(previous))[:, None]
         entries = torch.cat([first, self._entries(actions[:, :-1])], 1)
-        inputs = self._inputs(entries, state, context_per_step(context, actions.shape[1]))
+        inputs = self._inputs(entries, state, context)
         out, hidden = self._encode(inputs, None if state is None else state[:, : state.shape[1] - self.input_size])
         nats = self._forecast(out.flatten(0, 1), inputs.flatten(0, 1)).log_prob(actions.flatten(0, 1))
         return nats.view(actions.shape[:2]), torch.cat([hidden, inputs[:, -1]], 1)
@@ -314,7 +314,7 @@ class VectorGRU(VectorPrior):
     def action_log_probs(self, plans: VectorPlans) -> Tensor:
         self.check_plans(plans)
         plans = plans.to(self.device)
-        actions, context = plans.actions, context_per_step(plans.context, plans.max_length)
+        actions, context = plans.actions, plans.context
         if not plans.max_length or not len(plans):
             return torch.zeros(actions.shape[:2], device=self.device)
         parts, at_once, state = [], self.memory or plans.max_length, None

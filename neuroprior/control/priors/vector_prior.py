@@ -17,6 +17,7 @@ from neuroprior.control.vector_plans import (
     check_finite,
     check_vectors,
 )
+from neuroprior.plans.sequences import expand_context
 from neuroprior.priors.saved import SavedModule
 
 INNERMOST = 1 - 2**-24
@@ -310,8 +311,8 @@ class VectorPrior(SavedModule):
         check_vectors("past", past, self.action_low, self.action_high)
         self.check_context(context, len(past))
         steps = past.shape[1] + 1
-        context = context_per_step(context, steps)
         if context is not None:
+            context = expand_context(context, steps)
             if context.shape[1] != steps:
                 raise ValueError(
                     f"`context` must have shape {[len(past), steps, self.context_size]}, one before each vector of the"
@@ -349,7 +350,7 @@ class VectorPrior(SavedModule):
         """
         self.check_plans(plans)
         plans = plans.to(self.device)
-        actions, context = plans.actions, context_per_step(plans.context, plans.max_length)
+        actions, context = plans.actions, plans.context
         if not plans.max_length or not len(plans):
             return torch.zeros(actions.shape[:2], device=self.device)
         forecast, state = self.start(len(plans), None if context is None else context[:, 0])
@@ -420,8 +421,3 @@ class VectorPrior(SavedModule):
         if plans.action_names is not None:
             self.action_names = tuple(map(str, plans.action_names))
         return plans[plans.mask().any(1)].to(self.device)
-
-
-def context_per_step(context: Tensor | None, steps: int) -> Tensor | None:
-    """The context `[N, steps, C]` before each of so many vectors; that of whole plans, `[N, C]`, is the same at all."""
-    return context if context is None or context.dim() == 3 else context[:, None].expand(-1, steps, -1)

@@ -6,8 +6,9 @@ import torch
 from scipy.special import roots_legendre
 from torch import Tensor
 
-from neuroprior.control.priors.vector_prior import GaussianForecast, VectorPrior, context_per_step
+from neuroprior.control.priors.vector_prior import GaussianForecast, VectorPrior
 from neuroprior.control.vector_plans import VectorPlans
+from neuroprior.plans.sequences import constant_context, expand_context
 from neuroprior.priors import load, save
 from neuroprior.testing.chi_square import chi_square
 from neuroprior.testing.rules import FALSE_ALARM, raises, require
@@ -75,7 +76,7 @@ def random_plans(
 
 def _stepped(prior: VectorPrior, plans: VectorPlans) -> list[tuple[GaussianForecast, Tensor]]:
     """What `start` and `step` return before each vector of plans."""
-    context = context_per_step(plans.context, plans.max_length)
+    context = plans.context
     found = [prior.start(len(plans), None if context is None else context[:, 0])]
     for t in range(1, plans.max_length):
         found.append(prior.step(plans.actions[:, t - 1], found[-1][1], None if context is None else context[:, t]))
@@ -90,7 +91,7 @@ def _check_stepping(prior: VectorPrior, plans: VectorPlans) -> None:
     require(not whole.isnan().any(), "action_log_probs: NaN")
     require(prior.log_prob(plans).allclose(whole.sum(-1), atol=1e-3), "log_prob is not the sum of action_log_probs")
     order = torch.arange(num - 1, -1, -1, device=plans.actions.device)
-    context = context_per_step(plans.context, length)
+    context = plans.context
     for t, (forecast, state) in enumerate(_stepped(prior, plans)):
         where = f"plans of length {length}, vector {t}"
         require(isinstance(state, Tensor) and len(state) == num, f"state must be one tensor of {num} rows ({where})")
@@ -110,7 +111,7 @@ def _check_reading(prior: VectorPrior, plans: VectorPlans) -> None:
     steps = plans.max_length
     if prior.memory is None or steps <= prior.memory + 1:
         return
-    context = context_per_step(plans.context, steps)
+    context = plans.context
     context = None if context is None else torch.cat([context, context[:, -1:]], 1)
     # One vector more than is read: a prior may know that a shorter past is the beginning of a plan.
     known = prior.memory + 1
@@ -162,7 +163,7 @@ def _check_samples(prior: VectorPrior, plans: VectorPlans, num_plans: int, gener
     Of two dimensions the first vector is tested, of one dimension every vector.
     """
     rows = min(num_plans, 1000)
-    context = None if plans.context is None else plans.context[:1]
+    context = None if plans.context is None else plans.context[:1, 0]
     length = min(plans.max_length, 3)
     past = plans.actions[:1, :2]
     for known in (past[:, :0], past):
@@ -171,7 +172,7 @@ def _check_samples(prior: VectorPrior, plans: VectorPlans, num_plans: int, gener
         vectors = sampled[0]
         inside = (vectors >= prior.action_low) & (vectors <= prior.action_high)
         require(bool(inside.all()), "sample: vectors beyond the bounds")
-        forecast, state = prior.read(known, context_per_step(context, known.shape[1] + 1))
+        forecast, state = prior.read(known, None if context is None else expand_context(context, known.shape[1] + 1))
         if prior.action_size == 2:
             ranks = _marginal_ranks(prior, forecast, vectors[:, 0, 0], generator)
             _check_uniform(ranks, "vector 0, dimension 0")
@@ -241,9 +242,10 @@ def _ranks_on(grid: Tensor, density: Tensor, values: Tensor, generator: torch.Ge
 def _check_seeds(prior: VectorPrior, length: int, generator: torch.Generator) -> None:
     """The same seed gives the same plans; torch's global generator is not used."""
     plans = random_plans(prior, "plan" if prior.takes_context else None, 2, length, generator)
+    context = constant_context(plans)
     before = torch.get_rng_state()
     first, second = (
-        prior.sample(16, length, plans.context, past=plans.actions, generator=torch.Generator().manual_seed(1))
+        prior.sample(16, length, context, past=plans.actions, generator=torch.Generator().manual_seed(1))
         for _ in range(2)
     )
     require(first.equal(second), "sample: the same seed gave other plans")

@@ -261,7 +261,7 @@ class _Rows:
             plans = replace(plans, **more)
         except ValueError as error:
             raise ValueError(f"{self.path}: {error}") from None
-        notes = feature_notes(plans.context, plans.max_length)
+        notes = feature_notes(None if context is None else torch.from_numpy(context), plans.max_length)
         if self.unused:
             notes.append(f"keys that are not used: {listed(sorted(self.unused))}")
         if notes:

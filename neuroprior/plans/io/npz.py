@@ -15,7 +15,7 @@ from neuroprior._files import written_whole
 from neuroprior.plans.columns import Names, check_file, feature_notes, listed, never_notes
 from neuroprior.plans.io.assembly import renamed
 from neuroprior.plans.plans import Plans
-from neuroprior.plans.sequences import counted
+from neuroprior.plans.sequences import constant_context, counted
 
 NUMBERS = ("actions", "lengths", "context", "group", "durations", "condition")
 NAMES = ("action_names", "context_names", "group_names", "condition_names", "plan_names")
@@ -55,7 +55,7 @@ def read_npz(path: Path, num_actions: int | None, action_names: Names | None) ->
         if plans.context is not None and plans.context.is_floating_point():
             check_single_precision("context", counted(plans.context, plans.mask()))
         notes = list(never_notes(plans.actions[plans.mask()].numpy(), known) if guessed else [])
-        notes += feature_notes(plans.context, plans.max_length)
+        notes += feature_notes(numbers.get("context"), plans.max_length)
         if unused:
             notes.append(f"arrays that are not used: {listed(unused)}")
         plans = replace(plans, notes=tuple(notes))
@@ -68,6 +68,8 @@ def read_npz(path: Path, num_actions: int | None, action_names: Names | None) ->
 def write_npz(plans: Plans, path: Path) -> None:
     """Write a `.npz` file, not compressed."""
     tensors = {key: getattr(plans, key) for key in NUMBERS}
+    once = constant_context(plans)  # a context that never changes is written once a plan
+    tensors["context"] = plans.context if once is None else once
     arrays = {key: as_array(value) for key, value in tensors.items() if value is not None}
     for key in NAMES:
         if getattr(plans, key) is not None:

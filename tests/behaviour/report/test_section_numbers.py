@@ -109,7 +109,7 @@ def test_all_plans_are_described_whichever_were_scored_and_sampled(section, plan
         (None, "none"),
         (torch.tensor([[0, 4], [1, 1]]), "5 contexts, at each step"),
         (torch.zeros(2, 3), "features, once a plan"),
-        (torch.eye(2)[[[0, 1], [1, 0]]], "features, at each step"),
+        (torch.eye(2)[torch.tensor([[0, 1], [1, 0]])], "features, at each step"),
     ],
 )
 def test_what_the_context_is(context, words):

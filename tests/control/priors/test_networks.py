@@ -8,7 +8,6 @@ from torch import Tensor
 
 from neuroprior.control import AutoregressivePrior, NoisePrior, VectorGRU, VectorPrior
 from neuroprior.control.priors.linear_gaussian import held_out_split
-from neuroprior.control.priors.vector_prior import context_per_step
 from neuroprior.control.vector_plans import VectorPlans
 
 LOW, HIGH = torch.tensor([-1.0, 0.5]), torch.tensor([2.0, 3.0])
@@ -49,7 +48,7 @@ def test_scoring_whole_plans_equals_stepping_and_reading_beyond_the_training_win
     whole = prior.action_log_probs(data)
     assert whole.allclose(VectorPrior.action_log_probs(prior, data), atol=1e-4)
     for t in range(4):  # where the past is shorter than `memory`, reading is stepping
-        context = context_per_step(data.context, 13)
+        context = data.context
         forecast, _ = prior.read(data.actions[:, :t], None if context is None else context[:, : t + 1])
         assert forecast.log_prob(data.actions[:, t]).allclose(whole[:, t], atol=1e-4)
 

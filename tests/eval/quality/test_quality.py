@@ -205,7 +205,7 @@ def context_at(source, plans: Plans, t: int) -> torch.Tensor | int:
     """The context of `plans` at action t."""
     if plans.context is None:
         return 0
-    return plans.context[:, t] if source.context == "step" else plans.context
+    return plans.context[:, t]
 
 
 def history_at(source, actions: torch.Tensor, t: int) -> torch.Tensor:

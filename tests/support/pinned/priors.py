@@ -32,6 +32,7 @@ from neuroprior.priors import (
 from neuroprior.priors.fitting import PRIORS
 from neuroprior.priors.macros import CRITERIA
 from neuroprior.puzzles import LogLinearPrior, Steps
+from neuroprior.sampling.states import tensors_in
 from tests.support.pinned.data import behaviour, timed
 from tests.support.sources import seeded
 from tests.support.unchanged import case
@@ -44,7 +45,7 @@ def of_prior(prior: Prior, plans: Plans, draws: bool = True) -> dict[str, Any]:
     few = plans[:5]
     context = few.context if prior.takes_context else None
     per_step = context is not None and prior.context_per == "step"
-    contexts = [context[:, t] if per_step else context for t in range(3)] if context is not None else [None] * 3
+    contexts = [context[:, t if per_step else 0] for t in range(3)] if context is not None else [None] * 3
     with torch.no_grad():
         logits, state = prior.start(5, contexts[0])
         for t in range(2):
@@ -53,7 +54,7 @@ def of_prior(prior: Prior, plans: Plans, draws: bool = True) -> dict[str, Any]:
             "log_prob": prior.log_prob(plans),
             "actions": prior.action_log_probs(few[:2]),
             "after two": logits,
-            "state": state.double() if state.dtype != torch.bool else state,
+            "state": [values.double() for values in tensors_in(state)],
             "config": prior.config,
             "names": [prior.action_names, prior.context_names, prior.end, prior.context_per],
         }
@@ -62,7 +63,7 @@ def of_prior(prior: Prior, plans: Plans, draws: bool = True) -> dict[str, Any]:
                 found[name] = prior.sample(
                     5,
                     6,
-                    None if context is None else few.context[:, :6] if per_step else context,
+                    None if context is None else few.context[:, :6] if per_step else context[:, 0],
                     generator=seeded(1),
                     **how,
                 )
