@@ -192,11 +192,10 @@ def learned(
         yield Key(kind, number), [prior.fit(own[(taught.goal == k) & some]) for k, prior in enumerate(best)], power
 
 
-def progress(distance: Tensor, plans: Plans) -> Tensor:
-    """How much nearer walks have come to each goal after each number of moves, `[B, L + 1, K]`."""
-    assert plans.context is not None
-    along = distance[:, plans.context].permute(1, 2, 0)
-    return along[:, :1] - torch.cat([along, along[:, -1:]], 1)  # nobody asks after the last of all moves
+def progress(distance: Tensor, cells: Tensor) -> Tensor:
+    """How much nearer walks through `cells [B, L + 1]` have come to each goal after each number of moves."""
+    along = distance[:, cells].permute(1, 2, 0)
+    return along[:, :1] - along
 
 
 def grid_entries(world: str, settings: IntentionSettings, generator: torch.Generator) -> Iterator[dict[str, Any]]:
@@ -207,13 +206,13 @@ def grid_entries(world: str, settings: IntentionSettings, generator: torch.Gener
         plans, cells = walk(scene, goal[:, None].expand(-1, LONGEST), generator)
         return plans, cells, Agents(goal, plans.mask().sum(1))
 
-    training, _, taught = walks(torch.arange(settings.goals).repeat_interleave(max(settings.num_plans)))
+    training, trained, taught = walks(torch.arange(settings.goals).repeat_interleave(max(settings.num_plans)))
     plans, cells, seen = walks(torch.randint(settings.goals, (settings.agents,), generator=generator))
     priors: dict[Key, list[Prior]] = {Key("exact", 0): [*map(policy_prior, scene.policies)]}
     found = {Key("uniform", 0): torch.zeros(settings.agents, LONGEST + 1, settings.goals).double()}
     for name, table in (("path", scene.path), ("straight", scene.straight)):
-        scale = taught.best_scale(progress(table, training), settings.observed)
-        found[Key(name, 0)] = scale * progress(table, plans)
+        scale = taught.best_scale(progress(table, trained), settings.observed)
+        found[Key(name, 0)] = scale * progress(table, cells)
     found[Key("exact", 0)] = infer(priors[Key("exact", 0)], plans).log_probs
     for key, own, power in learned(scene, taught, training, settings):
         priors[key], found[key] = own, infer(own, plans).log_probs
