@@ -8,7 +8,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_range, check_single_precision, check_sizes, is_integer
 from neuroprior.plans.columns import check_distinct
-from neuroprior.plans.sequences import Sequences, check_index, counted, expand_context
+from neuroprior.plans.sequences import Sequences, check_index, expand_context
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -83,7 +83,7 @@ class VectorPlans(Sequences):
             raise ValueError(f"`context` must have shape [{num}, C] or [{num}, {length}, C], got {list(shape)}")
         context = expand_context(context, length).masked_fill(~self.mask()[..., None], 0)
         check_finite("context", context)
-        check_single_precision("context", counted(torch.as_tensor(self.context), self.mask()))
+        check_single_precision("context", expand_context(torch.as_tensor(self.context), length)[self.mask()])
         return context
 
     @property

@@ -134,11 +134,6 @@ class Sequences(ABC):
         return self[~index], self[index]
 
 
-def counted(features: Tensor, mask: Tensor) -> Tensor:
-    """The rows `[n, C]` of `features [N, C]`, or of those `[N, L, C]` where `mask [N, L]` is True."""
-    return features[mask] if features.dim() == 3 else features
-
-
 def is_per_plan(context: Tensor) -> bool:
     """Returns whether a context is given once a plan: indices `[N]` or features `[N, C]`.
 

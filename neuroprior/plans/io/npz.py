@@ -15,7 +15,7 @@ from neuroprior._files import written_whole
 from neuroprior.plans.columns import Names, check_file, feature_notes, listed, never_notes
 from neuroprior.plans.io.assembly import renamed
 from neuroprior.plans.plans import Plans
-from neuroprior.plans.sequences import constant_context, counted
+from neuroprior.plans.sequences import constant_context
 
 NUMBERS = ("actions", "lengths", "context", "group", "durations", "condition")
 NAMES = ("action_names", "context_names", "group_names", "condition_names", "plan_names")
@@ -53,7 +53,7 @@ def read_npz(path: Path, num_actions: int | None, action_names: Names | None) ->
             known = _largest(numbers) + 1 if action_names is None else len(action_names)
         plans = Plans(num_actions=known, end=end, **numbers, **names)
         if plans.context is not None and plans.context.is_floating_point():
-            check_single_precision("context", counted(plans.context, plans.mask()))
+            check_single_precision("context", plans.context[plans.mask()])
         notes = list(never_notes(plans.actions[plans.mask()].numpy(), known) if guessed else [])
         notes += feature_notes(numbers.get("context"), plans.max_length)
         if unused:

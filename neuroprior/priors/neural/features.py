@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from neuroprior._checks import check_single_precision
-from neuroprior.plans.sequences import Sequences, counted
+from neuroprior.plans.sequences import Sequences
 
 MOST = 10.0
 """Standard deviations beyond which a feature counts as so far away: a network knows nothing of what lies there."""
@@ -50,7 +50,7 @@ class Standardise(nn.Module):
             ValueError: a feature whose variation single precision does not hold, though the context is float64.
         """
         if plans.context is not None and len(plans):
-            features = counted(plans.context, plans.mask())
+            features = plans.context[plans.mask()]
             check_single_precision("context", features)
             self.learn(features)
 
