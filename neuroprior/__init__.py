@@ -15,12 +15,10 @@ from neuroprior._version import __version__
 if TYPE_CHECKING:
     from neuroprior.planners import (
         ExhaustivePlanner,
-        FrontierPlanner,
         MCTSPlanner,
         Planner,
         SamplingPlanner,
         collect,
-        execute,
         oracle,
     )
     from neuroprior.plans import Plans, read_plans, write_plans
@@ -28,19 +26,14 @@ if TYPE_CHECKING:
         CombinedPrior,
         ContextTreePrior,
         GRUPrior,
-        MacroPrior,
         MarkovPrior,
-        MixturePrior,
         Prior,
-        StackedPrior,
         TransformerPrior,
         UniformPrior,
-        decode,
         fit,
         load,
         save,
     )
-    from neuroprior.priors.scoring import score
     from neuroprior.sampling import sample
     from neuroprior.worlds import TabularWorld, World, from_gymnasium, gridworld
 
@@ -48,25 +41,19 @@ __all__ = [
     "CombinedPrior",
     "ContextTreePrior",
     "ExhaustivePlanner",
-    "FrontierPlanner",
     "GRUPrior",
     "MCTSPlanner",
-    "MacroPrior",
     "MarkovPrior",
-    "MixturePrior",
     "Planner",
     "Plans",
     "Prior",
     "SamplingPlanner",
-    "StackedPrior",
     "TabularWorld",
     "TransformerPrior",
     "UniformPrior",
     "World",
     "__version__",
     "collect",
-    "decode",
-    "execute",
     "fit",
     "from_gymnasium",
     "gridworld",
@@ -75,11 +62,10 @@ __all__ = [
     "read_plans",
     "sample",
     "save",
-    "score",
     "write_plans",
 ]
 
-_ROOMS = ("plans", "worlds", "sampling", "priors", "priors.scoring", "planners")
+_ROOMS = ("plans", "worlds", "sampling", "priors", "planners")
 """Where the names above are: those that import the fewest others first."""
 
 _OTHER_ROOMS = ("agents", "behaviour", "control", "puzzles", "testing", "training")
@@ -98,4 +84,4 @@ if not TYPE_CHECKING:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__, *_ROOMS, *_OTHER_ROOMS} - {"priors.scoring"})
+    return sorted({*globals(), *__all__, *_ROOMS, *_OTHER_ROOMS})

@@ -8,11 +8,9 @@ import torch
 import neuroprior.behaviour as analysis
 from neuroprior import (
     ExhaustivePlanner,
-    FrontierPlanner,
     GRUPrior,
     MarkovPrior,
     MCTSPlanner,
-    MixturePrior,
     Plans,
     SamplingPlanner,
     UniformPrior,
@@ -21,16 +19,16 @@ from neuroprior import (
     oracle,
     read_plans,
     save,
-    score,
     write_plans,
 )
 from neuroprior.__main__ import main
 from neuroprior.behaviour.report.figures import ethogram_figure
 from neuroprior.behaviour.report.plan_report import report
 from neuroprior.control import ICEMPlanner, PlanarArm, control
-from neuroprior.planners import expected_score
+from neuroprior.planners import FrontierPlanner, expected_score
 from neuroprior.plans import folds
-from neuroprior.priors import CombinedPrior, learn_macros
+from neuroprior.priors import CombinedPrior, MixturePrior, learn_macros
+from neuroprior.priors.scoring import score
 from neuroprior.worlds import cube
 from tests.support.sources import refuses, seeded
 

@@ -14,13 +14,11 @@ from neuroprior import (
     GRUPrior,
     MarkovPrior,
     MCTSPlanner,
-    MixturePrior,
     Plans,
     SamplingPlanner,
     TransformerPrior,
     UniformPrior,
     collect,
-    execute,
     gridworld,
     oracle,
 )
@@ -41,9 +39,9 @@ from neuroprior.behaviour import (
 )
 from neuroprior.behaviour.report.plan_report import report
 from neuroprior.control import ICEMPlanner, MPPIPlanner, NoisePrior, ShootingPlanner, VectorGRU, VectorPlans
-from neuroprior.planners import expected_score, value_iteration
+from neuroprior.planners import execute, expected_score, value_iteration
 from neuroprior.plans import all_plans, folds, in_parts
-from neuroprior.priors import CombinedPrior, StackedPrior, SwitchingPrior
+from neuroprior.priors import CombinedPrior, MixturePrior, StackedPrior, SwitchingPrior
 from neuroprior.puzzles import AStarPlanner
 from neuroprior.training import Settings
 from neuroprior.worlds import four_rooms, maze

@@ -21,7 +21,6 @@ from neuroprior import (
     TransformerPrior,
     UniformPrior,
     collect,
-    execute,
     fit,
     gridworld,
     load,
@@ -42,7 +41,7 @@ from neuroprior.control import (
     VectorPrior,
     control,
 )
-from neuroprior.planners import FrontierPlanner, oracle
+from neuroprior.planners import FrontierPlanner, execute, oracle
 from neuroprior.priors import CombinedPrior, MixturePrior, StackedPrior, SwitchingPrior
 from neuroprior.priors.neural import cuda_graphs as recordings
 from neuroprior.puzzles import AStarPlanner, LevinPlanner, sliding_tiles, sokoban

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import neuroprior
-from neuroprior import CombinedPrior, MarkovPrior, MixturePrior, Plans, StackedPrior, TabularWorld, UniformPrior
+from neuroprior import CombinedPrior, MarkovPrior, Plans, TabularWorld, UniformPrior
 from neuroprior.__main__ import main
 from neuroprior.behaviour import DurationModel, SemiMarkovPrior
 from neuroprior.control import (
@@ -18,7 +18,7 @@ from neuroprior.control import (
     vector_plans_from_trajectories,
     write_vector_plans,
 )
-from neuroprior.priors import SwitchingPrior, forecast, infer, load, save
+from neuroprior.priors import MixturePrior, StackedPrior, SwitchingPrior, forecast, infer, load, save
 from neuroprior.puzzles import LogLinearPrior, SokobanWorld, Steps, read_sokoban, sliding_tiles, sokoban
 from neuroprior.worlds import cube, gridworld
 from tests.support.sources import refuses, seeded

@@ -3,17 +3,9 @@
 import pytest
 import torch
 
-from neuroprior import (
-    GRUPrior,
-    MarkovPrior,
-    SamplingPlanner,
-    StackedPrior,
-    TransformerPrior,
-    UniformPrior,
-    collect,
-    gridworld,
-)
+from neuroprior import GRUPrior, MarkovPrior, SamplingPlanner, TransformerPrior, UniformPrior, collect, gridworld
 from neuroprior._checks import physical_memory
+from neuroprior.priors import StackedPrior
 from neuroprior.sampling import sample_in_world
 from neuroprior.worlds import cube
 from tests.support.sources import refuses

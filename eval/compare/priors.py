@@ -10,19 +10,9 @@ import torch
 from torch import Tensor
 
 from eval.worlds.contexts import ContextIndex
-from neuroprior import (
-    CombinedPrior,
-    GRUPrior,
-    MacroPrior,
-    MarkovPrior,
-    Plans,
-    Prior,
-    TabularWorld,
-    TransformerPrior,
-    World,
-    load,
-)
+from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, Prior, TabularWorld, TransformerPrior, World, load
 from neuroprior.behaviour.analysis.comparison import score
+from neuroprior.priors import MacroPrior
 from neuroprior.priors.matching import numbers
 
 ORDERS = range(5)

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import torch
 
 from eval.options.planner import OptionPlanner
-from neuroprior import MacroPrior, MarkovPrior, Plans, Prior, SamplingPlanner, UniformPrior
+from neuroprior import MarkovPrior, Plans, Prior, SamplingPlanner, UniformPrior
 from neuroprior.behaviour.analysis.comparison import score
-from neuroprior.priors import SwitchingPrior
+from neuroprior.priors import MacroPrior, SwitchingPrior
 
 ORDERS = range(8)
 """Orders of the flat chains."""

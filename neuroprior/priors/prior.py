@@ -311,7 +311,7 @@ class Prior(SavedModule):
         After a `past` of executed actions, `[T]` or `[num_plans, T]`, plans go on from these, as a planner that replans
         needs them.
 
-        `neuroprior.decode(plans, prior)` gives their names.
+        `neuroprior.priors.decode(plans, prior)` gives their names.
 
         Raises:
             ValueError: an argument is out of range, or the context does not fit.

@@ -13,18 +13,18 @@ from neuroprior import (
     ExhaustivePlanner,
     GRUPrior,
     MarkovPrior,
-    MixturePrior,
     Plans,
     SamplingPlanner,
     TabularWorld,
     UniformPrior,
     World,
-    execute,
     gridworld,
     load,
     save,
 )
 from neuroprior.agents import Agent, checkpoints, restore_agent, save_agent
+from neuroprior.planners import execute
+from neuroprior.priors import MixturePrior
 from neuroprior.puzzles import AStarPlanner
 from tests.support.sources import corridor, every_plan, refuses, seeded, stochastic_world
 

@@ -13,9 +13,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, StackedPrior, TransformerPrior, load
+from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, TransformerPrior, load
 from neuroprior.behaviour import Baseline
 from neuroprior.plans import read_plans, write_minari, write_plans
+from neuroprior.priors import StackedPrior
 from neuroprior.priors.scoring import learned_from
 from neuroprior.training import PriorModule, Settings
 from tests.support.sources import seeded

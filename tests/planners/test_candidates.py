@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from neuroprior import FrontierPlanner, MarkovPrior, MCTSPlanner, TabularWorld
-from neuroprior.planners import SamplingPlanner
+from neuroprior import MarkovPrior, MCTSPlanner, TabularWorld
+from neuroprior.planners import FrontierPlanner, SamplingPlanner
 from tests.support.sources import FALSE_ALARM, p_value, seeded
 
 SHARES = torch.tensor([0.6, 0.4])

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from neuroprior import ExhaustivePlanner, SamplingPlanner, TabularWorld, UniformPrior, collect, execute, gridworld
+from neuroprior import ExhaustivePlanner, SamplingPlanner, TabularWorld, UniformPrior, collect, gridworld
+from neuroprior.planners import execute
 from tests.support.sources import corridor, random_world, refuses, seeded, stochastic_world
 
 

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from neuroprior import (
     ExhaustivePlanner,
-    FrontierPlanner,
     GRUPrior,
     MarkovPrior,
     Plans,
@@ -18,7 +17,7 @@ from neuroprior import (
     gridworld,
     oracle,
 )
-from neuroprior.planners import frontier
+from neuroprior.planners import FrontierPlanner, frontier
 from neuroprior.worlds import cube, egocentric, maze
 from tests.support.sources import random_world, refuses, seeded, stochastic_world
 

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from neuroprior import FrontierPlanner, MarkovPrior, MCTSPlanner, SamplingPlanner, UniformPrior
+from neuroprior import MarkovPrior, MCTSPlanner, SamplingPlanner, UniformPrior
+from neuroprior.planners import FrontierPlanner
 from neuroprior.sampling import Steppable, sample, sample_in_world
 from neuroprior.testing import check_planner
 from tests.support.sources import random_world, refuses, seeded, stochastic_world

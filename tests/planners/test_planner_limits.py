@@ -12,12 +12,11 @@ from neuroprior import (
     UniformPrior,
     World,
     collect,
-    execute,
     gridworld,
     oracle,
 )
 from neuroprior.agents import Agent
-from neuroprior.planners import FrontierPlanner, MCTSPlanner, best_sampling, extend_horizon
+from neuroprior.planners import FrontierPlanner, MCTSPlanner, best_sampling, execute, extend_horizon
 from neuroprior.puzzles import AStarPlanner, LevinPlanner, bootstrap, sliding_tiles
 
 MAKERS = {

@@ -6,9 +6,10 @@ from math import log
 import pytest
 import torch
 
-from neuroprior import CombinedPrior, MarkovPrior, MixturePrior, Plans, SamplingPlanner, TabularWorld, UniformPrior
+from neuroprior import CombinedPrior, MarkovPrior, Plans, SamplingPlanner, TabularWorld, UniformPrior
 from neuroprior.planners import best_sampling, proposers, search_weights
 from neuroprior.planners.tuning import choices, log_inclusion
+from neuroprior.priors import MixturePrior
 from neuroprior.testing import check_planner
 from neuroprior.worlds import gridworld
 from tests.support.sources import refuses, seeded, stochastic_world

@@ -2,7 +2,8 @@
 
 import torch
 
-from neuroprior import MarkovPrior, Plans, UniformPrior, decode
+from neuroprior import MarkovPrior, Plans, UniformPrior
+from neuroprior.priors import decode
 from tests.support.sources import refuses, seeded
 
 WORDS = Plans(torch.tensor([[0, 1, 2], [2, 2, 0]]), 3, torch.tensor([3, 2]), ("rest", "walk", "eat"))

@@ -5,9 +5,9 @@ from math import log
 import pytest
 import torch
 
-from neuroprior import MarkovPrior, Plans, UniformPrior, score
+from neuroprior import MarkovPrior, Plans, UniformPrior
 from neuroprior.priors import match_plans
-from neuroprior.priors.scoring import keep_learned, learned_from
+from neuroprior.priors.scoring import keep_learned, learned_from, score
 from tests.support.sources import refuses, seeded
 
 NAMES = ("groom", "rear", "walk")

@@ -9,7 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuroprior import GRUPrior, MarkovPrior, MixturePrior, Plans, TabularWorld, TransformerPrior, UniformPrior, collect
+from neuroprior import GRUPrior, MarkovPrior, Plans, TabularWorld, TransformerPrior, UniformPrior, collect
+from neuroprior.priors import MixturePrior
 from neuroprior.puzzles import (
     AStarPlanner,
     BestFirstPlanner,

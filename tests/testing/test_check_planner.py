@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from neuroprior import ExhaustivePlanner, FrontierPlanner, MCTSPlanner, Planner, SamplingPlanner, TabularWorld
-from neuroprior.planners import Decision
+from neuroprior import ExhaustivePlanner, MCTSPlanner, Planner, SamplingPlanner, TabularWorld
+from neuroprior.planners import Decision, FrontierPlanner
 from neuroprior.testing import check_planner
 from tests.support.sources import TablePrior, refuses, seeded
 

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from neuroprior import GRUPrior, Plans, StackedPrior
+from neuroprior import GRUPrior, Plans
+from neuroprior.priors import StackedPrior
 from neuroprior.training import Settings, train
 from tests.support.sources import refuses, seeded
 

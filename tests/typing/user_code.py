@@ -24,7 +24,6 @@ from neuroprior import (
     TabularWorld,
     World,
     collect,
-    execute,
     fit,
     gridworld,
     load,
@@ -34,7 +33,7 @@ from neuroprior import (
 )
 from neuroprior.behaviour import DurationModel, mean_interval, order_selection
 from neuroprior.control import DoubleIntegrator, ICEMPlanner, NoisePrior, VectorDecision, VectorPlans, VectorPrior
-from neuroprior.planners import Decision, Execution
+from neuroprior.planners import Decision, Execution, execute
 from neuroprior.testing import check_planner, check_prior, check_world
 from neuroprior.worlds import GridWorld, Rollout
 

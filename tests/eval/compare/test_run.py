@@ -27,7 +27,8 @@ from eval.worlds.runs import Run
 from eval.worlds.splits import Worlds, from_seeds
 from eval.worlds.starts import starts_of
 from eval.worlds.suite import TASKS, Task, best_score
-from neuroprior import ExhaustivePlanner, MarkovPrior, MixturePrior, TabularWorld, UniformPrior, collect, save
+from neuroprior import ExhaustivePlanner, MarkovPrior, TabularWorld, UniformPrior, collect, save
+from neuroprior.priors import MixturePrior
 from neuroprior.worlds import cube, four_rooms, goal_direction, local_view, maze
 from tests.support.sources import refuses, seeded
 

@@ -5,7 +5,8 @@ import torch
 
 from eval.live.foraging import ForagingWorld, patches
 from eval.live.oracle import ForagingOracle
-from neuroprior import ExhaustivePlanner, FrontierPlanner, MarkovPrior, SamplingPlanner, UniformPrior, gridworld
+from neuroprior import ExhaustivePlanner, MarkovPrior, SamplingPlanner, UniformPrior, gridworld
+from neuroprior.planners import FrontierPlanner
 from neuroprior.sampling import sample_in_world
 from neuroprior.testing import check_world
 from neuroprior.worlds import egocentric, labyrinth, maze

@@ -19,13 +19,12 @@ from neuroprior import (
     MarkovPrior,
     Plans,
     Prior,
-    StackedPrior,
     TransformerPrior,
     UniformPrior,
     load,
     save,
 )
-from neuroprior.priors import MixturePrior
+from neuroprior.priors import MixturePrior, StackedPrior
 from neuroprior.priors.counts import BACKOFFS_TRIED, Chains, TooLargeError
 from neuroprior.priors.ensembles.candidates import ORDERS, best_chain
 from neuroprior.priors.ensembles.combined import HeldOut

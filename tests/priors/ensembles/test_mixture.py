@@ -6,18 +6,8 @@ from functools import cache
 import pytest
 import torch
 
-from neuroprior import (
-    ContextTreePrior,
-    GRUPrior,
-    MarkovPrior,
-    MixturePrior,
-    Plans,
-    StackedPrior,
-    TransformerPrior,
-    UniformPrior,
-    load,
-    save,
-)
+from neuroprior import ContextTreePrior, GRUPrior, MarkovPrior, Plans, TransformerPrior, UniformPrior, load, save
+from neuroprior.priors import MixturePrior, StackedPrior
 from neuroprior.priors.ensembles.mixture import divided
 from neuroprior.testing import check_prior
 from tests.support.sources import every_plan, seeded

@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
-from neuroprior import MarkovPrior, Plans, StackedPrior, load, save
+from neuroprior import MarkovPrior, Plans, load, save
 from neuroprior.behaviour.analysis.comparison import score
+from neuroprior.priors import StackedPrior
 from neuroprior.priors.ensembles.stacked import LONG_AGO
 from neuroprior.testing import check_prior
 from tests.support.sources import seeded

@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 import torch
 
-from neuroprior import CombinedPrior, MarkovPrior, MixturePrior, Plans, Prior, StackedPrior, UniformPrior
+from neuroprior import CombinedPrior, MarkovPrior, Plans, Prior, UniformPrior
+from neuroprior.priors import MixturePrior, StackedPrior
 from neuroprior.priors.counts import BACKOFFS_TRIED, Chains, HistoryPrior
 from neuroprior.priors.ensembles import stacked
 from neuroprior.priors.ensembles.candidates import NETWORKS, ORDERS, best_chain, counting_parts, fitted_experts

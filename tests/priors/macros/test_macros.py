@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from neuroprior import (
     ContextTreePrior,
     GRUPrior,
-    MacroPrior,
     MarkovPrior,
     Plans,
     SamplingPlanner,
@@ -20,7 +19,7 @@ from neuroprior import (
     load,
     save,
 )
-from neuroprior.priors import learn_macros
+from neuroprior.priors import MacroPrior, learn_macros
 from neuroprior.priors.macros import CRITERIA
 from neuroprior.testing import check_prior
 from tests.support.sources import every_plan, random_world, refuses, seeded
