@@ -13,6 +13,7 @@ from eval.worlds.contexts import ContextIndex
 from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, Prior, TabularWorld, TransformerPrior, World, load
 from neuroprior.behaviour.analysis.comparison import score
 from neuroprior.priors import MacroPrior
+from neuroprior.priors.learning import training_plans
 from neuroprior.priors.matching import numbers
 
 ORDERS = range(5)
@@ -104,7 +105,7 @@ class ContextMarkov(Prior):
 
     def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Choose the features, number the contexts, and count; returns self."""
-        plans = self.training_plans(plans)
+        plans = training_plans(self, plans)
         best: Sequence[int] | None = None
         if self.feature_sets:
             training, validation = plans.split(VALIDATION, torch.Generator().manual_seed(0))

@@ -15,8 +15,8 @@ from neuroprior.plans.columns import Columns, Missing
 from neuroprior.plans.folds import fair_split, longest_cut, num_units, ungrouped
 from neuroprior.plans.past_durations import PastDurations
 from neuroprior.priors import Prior
+from neuroprior.priors.construction import context_arguments
 from neuroprior.priors.fitting import make_prior
-from neuroprior.priors.prior import context_arguments
 from neuroprior.training import PlansModule, PriorModule, Settings
 from neuroprior.worlds import World
 

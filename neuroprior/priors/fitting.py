@@ -10,11 +10,12 @@ from torch import Tensor
 from neuroprior._registry import Registry
 from neuroprior.plans import Plans
 from neuroprior.plans.sequences import Sequences
+from neuroprior.priors.construction import construct, context_arguments
 from neuroprior.priors.counts import ContextTreePrior, MarkovPrior
 from neuroprior.priors.ensembles import CombinedPrior, MixturePrior, StackedPrior
 from neuroprior.priors.ensembles.candidates import Effort
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
-from neuroprior.priors.prior import Prior, as_actions, construct, context_arguments
+from neuroprior.priors.prior import Prior, as_actions
 from neuroprior.priors.switching import SwitchingPrior
 from neuroprior.priors.uniform import UniformPrior
 

@@ -1,8 +1,7 @@
 """The interface of a prior: a distribution over action sequences that is also a small state machine."""
 
-import inspect
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import Any, ClassVar, Literal, Self
 
@@ -10,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neuroprior._checks import check_memory, check_range, check_same_names, check_sizes, is_integer, kind_of
-from neuroprior.plans import Plans, check_context, check_patterns, constant_context, has_patterns
+from neuroprior.plans import Plans, check_context, check_patterns, has_patterns
 from neuroprior.plans.past_durations import PastDurations
 from neuroprior.plans.sequences import is_per_plan
 from neuroprior.priors.saved import SavedModule
@@ -248,9 +247,9 @@ class Prior(SavedModule):
         Raises:
             ValueError: other actions or another context than this prior's.
         """
-        plans = self._as_plans(plans)
+        plans = self.as_plans(plans)
         if plans.actions.numel() == 0:
-            self._check_scored(plans)
+            self.check_plans(plans)
             return torch.zeros(plans.actions.shape, device=self.device)
         parts = []
         for part, log_probs in self.forecasts(plans):
@@ -268,7 +267,7 @@ class Prior(SavedModule):
         Raises:
             ValueError: other actions or another context than this prior's.
         """
-        self._check_scored(plans)
+        self.check_plans(plans)
         plans = plans.to(self.device)
         size = max(self.actions_at_once // max(plans.max_length, 1), 1)
         for at in range(0, len(plans), size):
@@ -278,18 +277,13 @@ class Prior(SavedModule):
                 logits = torch.cat([logits[:, :1], after_end(logits[:, 1:], part.actions[:, :-1].long(), self.end)], 1)
             yield part, torch.log_softmax(logits, -1)
 
-    def _as_plans(self, plans: Plans | Tensor) -> Plans:
-        """`plans` on this prior's device."""
+    def as_plans(self, plans: Plans | Tensor) -> Plans:
+        """`plans` as `Plans`, on this prior's device."""
         return (plans if isinstance(plans, Plans) else Plans(as_actions(plans), self.num_actions)).to(self.device)
 
-    def _check_actions(self, plans: Plans) -> None:
-        if plans.num_actions != self.num_actions:
-            raise ValueError(
-                f"plans: {self.num_actions} actions are expected, as this prior has, not {plans.num_actions}"
-            )
-
-    def _check_scored(self, plans: Plans) -> None:
-        self._check_actions(plans)
+    def check_plans(self, plans: Plans) -> None:
+        """Raise ValueError unless the plans have this prior's actions and context, numbered alike."""
+        check_actions(self, plans)
         for what in ("action_names", "context_names"):
             remedy = "number them alike (neuroprior.priors.match_plans)"
             check_same_names(what, getattr(self, what), getattr(plans, what), "the plans", "this prior", remedy)
@@ -356,79 +350,6 @@ class Prior(SavedModule):
                 f" not {str(context.dtype).removeprefix('torch.')} of shape {list(context.shape)}"
             )
 
-    @property
-    def learns_anew(self) -> bool:
-        """Whether `fit` forgets what was learned before, so that the plans may have other names."""
-        return True
-
-    def training_plans(self, plans: Plans | Tensor) -> Plans:
-        """`plans` as `Plans` that this prior can learn from; keeps their names, end and kind of context.
-
-        A prior without context ignores that of the plans.
-
-        Raises:
-            ValueError: another number of actions, other names than those from which it learns further, or a context of
-                another kind than this prior takes.
-        """
-        plans = self._as_plans(plans)
-        self._check_actions(plans)
-        known = None if self.learns_anew else self.action_names
-        check_same_names("action_names", known, plans.action_names, "the plans", "this prior, which learns further")
-        self.end, self.has_learned = plans.end, True
-        self.action_names = known if plans.action_names is None else tuple(plans.action_names)
-        self.context_names = None
-        if not self.takes_context:
-            return plans.without_context()
-        self.check_context_of(plans)
-        self.context_per = "step" if constant_context(plans) is None else "plan"
-        if plans.context_names is not None and len(plans.context_names) <= (self.num_contexts or 0):
-            self.context_names = tuple(plans.context_names)
-        return plans
-
-    def validation_plans(self, plans: Plans) -> Plans:
-        """As `training_plans`, of plans that it does not learn from: it keeps nothing of them.
-
-        Raises:
-            ValueError: another number of actions, or a context of another kind than this prior takes.
-        """
-        kept = self.end, self.action_names, self.context_names, self.context_per, self.has_learned
-        self.action_names = None  # they are compared with those of the plans that are learned from
-        try:
-            return self.training_plans(plans)
-        finally:
-            self.end, self.action_names, self.context_names, self.context_per, self.has_learned = kept
-
-    def known_plans(self, plans: Plans | Tensor) -> Plans:
-        """`plans` with the actions and contexts that this prior knows, numbered alike; it keeps nothing of them.
-
-        A prior without context ignores that of the plans.
-
-        Raises:
-            ValueError: another number of actions, other names, a context of another kind, or no action at all.
-        """
-        plans = self._as_plans(plans)
-        if not self.takes_context:
-            plans = plans.without_context()
-        self._check_scored(plans)
-        if not bool(plans.mask().any()):
-            raise ValueError("plans: at least one with an action is expected")
-        return plans
-
-    def counted_plans(self, plans: Plans | Tensor) -> Plans:
-        """As `known_plans`, of plans in which `recount` counts: their ends are like those it learned from.
-
-        A prior that has not learned yet keeps their names, end and kind of context, as `training_plans` says.
-
-        Raises:
-            ValueError: see `known_plans`; or plans with another end.
-        """
-        plans = self.known_plans(plans)
-        if not self.has_learned:
-            return self.training_plans(plans)
-        if plans.end != self.end:
-            raise ValueError(f"plans: end={self.end} is expected, as in those it learned from, not {plans.end}")
-        return plans
-
     def check_settings(self, settings: Mapping[str, Any]) -> None:
         """Raise ValueError unless `fit` takes all of these settings."""
         known = self.fit_settings
@@ -439,64 +360,16 @@ class Prior(SavedModule):
                 )
 
 
+def check_actions(prior: Prior, plans: Plans) -> None:
+    """Raise ValueError unless the plans have as many actions as the prior."""
+    if plans.num_actions != prior.num_actions:
+        raise ValueError(f"plans: {prior.num_actions} actions are expected, as this prior has, not {plans.num_actions}")
+
+
 def check_is_prior(prior: object) -> None:
     """Raise ValueError unless it is a `Prior`."""
     if not isinstance(prior, Prior):
         raise ValueError(f"prior: a Prior is expected, not {kind_of(prior)}")
-
-
-def as_prior(given: Prior | Mapping[str, Any]) -> Prior:
-    """A prior that is given, or described as in the `config` of a prior made of priors: `prior` (its class), `config`.
-
-    Raises:
-        KeyError: the description lacks a key.
-        ValueError: it describes no prior that is known.
-    """
-    if isinstance(given, Prior):
-        return given
-    if not isinstance(given, Mapping):
-        raise ValueError(f"a prior is expected, not {given!r}")
-    kind = SavedModule.known.find(given["prior"])
-    if kind is None or not issubclass(kind, Prior):
-        raise ValueError(f"{given['prior']}: not a prior over numbered actions")
-    return kind(**given["config"])
-
-
-def described(prior: Prior) -> dict[str, Any]:
-    """A prior as `as_prior` makes it again, without what it learned: `prior`, the name of its class, and `config`."""
-    return {"prior": type(prior).__name__, "config": prior.config}
-
-
-def construct(make: Callable[..., Prior], num_actions: int, contexts: Mapping[str, int]) -> Prior:
-    """A prior from its class, or a function that makes it.
-
-    Args:
-        make: called with the number of actions, and those of `contexts` that it takes; of a `functools.partial`, what
-            it was given itself stands: there may be more contexts than occur in some plans.
-        num_actions: A.
-        contexts: `num_contexts`, `context_size` or `num_patterns`, or none.
-    """
-    parameters = inspect.signature(make).parameters
-    takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
-    given = {name for name, value in getattr(make, "keywords", {}).items() if value is not None}
-    wanted = {name: c for name, c in contexts.items() if (takes_any or name in parameters) and name not in given}
-    return make(num_actions, **wanted)
-
-
-def context_arguments(*some: Plans) -> dict[str, int]:
-    """The constructor's arguments for the context of plans: `num_contexts`, `context_size`, `num_patterns` or none.
-
-    The number of contexts is that of their names, if these are more than occur.
-    """
-    contexts = [plans.context for plans in some if plans.context is not None]
-    if not contexts:
-        return {}
-    if contexts[0].is_floating_point():
-        return {"context_size": contexts[0].shape[-1]}
-    if has_patterns(contexts[0]):
-        return {"num_patterns": contexts[0].shape[-1]}
-    most = max((int(context.max()) + 1 for context in contexts if context.numel()), default=1)
-    return {"num_contexts": max(most, *(len(plans.context_names or ()) for plans in some))}
 
 
 def _check_patterns_of(context: Tensor, num_patterns: int, num_plans: int, length: int, plans: bool) -> None:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from neuroprior.plans import Plans
+from neuroprior.priors.learning import training_plans
 from neuroprior.priors.prior import Prior
 
 
@@ -41,5 +42,5 @@ class UniformPrior(Prior):
             ValueError: plans of other actions, or any setting.
         """
         self.check_settings(settings)
-        self.training_plans(plans)
+        training_plans(self, plans)
         return self

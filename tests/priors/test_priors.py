@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior, UniformPrior, sample
+from neuroprior.priors.learning import training_plans
 from neuroprior.sampling import sample_in_world
 from tests.support.sources import distribution, every_plan, random_world, refuses, seeded
 
@@ -255,7 +256,7 @@ CALLS = {
 )
 def test_refuses_a_context(call, kind, takes, context, word):
     if call == "fit" and takes == "no context":  # which ignores the context of the plans
-        assert make(kind, takes).training_plans(Plans(torch.zeros(4, 2).long(), A, context=context)).context is None
+        assert training_plans(make(kind, takes), Plans(torch.zeros(4, 2).long(), A, context=context)).context is None
         return
     with refuses(word):
         CALLS[call](make(kind, takes), torch.zeros(4, 2, dtype=torch.long), context)

@@ -34,6 +34,7 @@ from neuroprior import (
 from neuroprior.behaviour import DurationModel, mean_interval, order_selection
 from neuroprior.control import DoubleIntegrator, ICEMPlanner, NoisePrior, VectorDecision, VectorPlans, VectorPrior
 from neuroprior.planners import Decision, Execution, execute
+from neuroprior.priors.learning import training_plans
 from neuroprior.testing import check_planner, check_prior, check_world
 from neuroprior.worlds import GridWorld, Rollout
 
@@ -93,7 +94,7 @@ class Inertia(Prior):
 
     def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         self.check_settings(settings)
-        actions = self.training_plans(plans).actions
+        actions = training_plans(self, plans).actions
         self.repeat = (actions[:, 1:] == actions[:, :-1]).float().mean()
         return self
 

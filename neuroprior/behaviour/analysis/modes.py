@@ -17,8 +17,8 @@ from neuroprior.plans import Plans, constant_context
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, num_units
 from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors import SwitchingPrior
+from neuroprior.priors.construction import context_arguments
 from neuroprior.priors.fitting import make_prior
-from neuroprior.priors.prior import context_arguments
 from neuroprior.priors.scoring import plan_frame
 
 STABLE = 0.7

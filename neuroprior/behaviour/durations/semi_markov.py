@@ -12,8 +12,10 @@ from neuroprior._random import generator_on
 from neuroprior.behaviour.durations.duration_model import DurationModel
 from neuroprior.behaviour.durations.laws import LAW_NAMES, LawName
 from neuroprior.plans import Plans
+from neuroprior.priors.construction import as_prior, construct, described
 from neuroprior.priors.counts import MarkovPrior
-from neuroprior.priors.prior import Prior, as_prior, construct, described
+from neuroprior.priors.learning import counted_plans, training_plans
+from neuroprior.priors.prior import Prior
 
 
 class SemiMarkovPrior(Prior):
@@ -111,13 +113,13 @@ class SemiMarkovPrior(Prior):
                 setting that the action prior does not have.
         """
         self.check_settings(settings)
-        plans = self.training_plans(plans)
+        plans = training_plans(self, plans)
         self.durations.fit(plans)
         self.actions.fit(plans, generator=generator, **settings)
         return self
 
     def recount(self, plans: Plans) -> Self:
-        plans = self.counted_plans(plans)
+        plans = counted_plans(self, plans)
         self.durations.fit(plans)
         self.actions.recount(plans)
         return self

@@ -18,11 +18,11 @@ from neuroprior.plans import Plans, constant_context
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, fair_split, folds, num_units
 from neuroprior.plans.past_durations import PastDurations
 from neuroprior.priors import CombinedPrior, GRUPrior, MarkovPrior, Prior, StackedPrior, TransformerPrior
+from neuroprior.priors.construction import construct, context_arguments
 from neuroprior.priors.counts import TooLargeError
 from neuroprior.priors.ensembles import candidates
 from neuroprior.priors.ensembles.candidates import Effort, fitted_experts, number_tried
 from neuroprior.priors.ensembles.mixture import divided
-from neuroprior.priors.prior import construct, context_arguments
 from neuroprior.sampling.ancestral import sample, sample_in_world
 from neuroprior.worlds import TabularWorld
 

@@ -11,6 +11,7 @@ from neuroprior._random import draw_seed
 from neuroprior._threads import share
 from neuroprior.plans import Plans, action_dtype
 from neuroprior.priors.counts.histories import MAX_TABLE_BYTES, Counts, Tree, count_histories
+from neuroprior.priors.learning import training_plans
 from neuroprior.priors.prior import Prior
 
 COMPILE_FROM = 2**20
@@ -124,7 +125,7 @@ class HistoryPrior(Prior):
         Raises:
             ValueError: other actions or another context than this prior's.
         """
-        self._check_scored(plans)
+        self.check_plans(plans)
         plans = plans.to(self.device)
         size = max(self.actions_at_once // max(plans.max_length, 1), 1)
         found = [torch.zeros(0, dtype=torch.long, device=self.device)]
@@ -182,7 +183,7 @@ class HistoryPrior(Prior):
         Raises:
             ValueError: as `fit`.
         """
-        plans = self.training_plans(plans)
+        plans = training_plans(self, plans)
         limit = self.max_table_bytes
         return count_histories(plans, self._depth, self.num_contexts, self.openings, self.device, max_bytes=limit)
 

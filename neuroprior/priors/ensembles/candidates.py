@@ -9,10 +9,11 @@ import torch
 from neuroprior._random import draw_seed
 from neuroprior.plans.folds import divisible, folds, in_parts, num_units, pieces, ungrouped
 from neuroprior.plans.plans import Plans
+from neuroprior.priors.construction import construct
 from neuroprior.priors.counts import BACKOFFS_TRIED, Chains, ContextTreePrior, MarkovPrior, TooLargeError
 from neuroprior.priors.ensembles.stacked import StackedPrior
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
-from neuroprior.priors.prior import Prior, construct
+from neuroprior.priors.prior import Prior
 from neuroprior.priors.uniform import UniformPrior
 
 Effort = Literal["fast", "standard", "full"]

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
+from neuroprior.priors.construction import as_prior, described
 from neuroprior.priors.counts import TooLargeError
 from neuroprior.priors.ensembles.candidates import Effort, check_effort, counting_parts, fitted_experts, number_tried
 from neuroprior.priors.ensembles.mixture import (
@@ -23,8 +24,9 @@ from neuroprior.priors.ensembles.mixture import (
     weights_before,
 )
 from neuroprior.priors.ensembles.stacked import context_for
+from neuroprior.priors.learning import counted_plans, known_plans, training_plans
 from neuroprior.priors.neural.neural import training_settings
-from neuroprior.priors.prior import Prior, as_prior, described, taken_of
+from neuroprior.priors.prior import Prior, taken_of
 from neuroprior.priors.uniform import UniformPrior
 from neuroprior.sampling.states import State
 
@@ -229,7 +231,7 @@ class CombinedPrior(MixturePrior):
             ValueError: plans that the experts cannot learn from, too few of them, or an unknown setting.
         """
         self.check_settings(settings)
-        plans = self.training_plans(plans)
+        plans = training_plans(self, plans)
         generator = generator_on(generator, "cpu")
         learned, held_out = divided(plans, self._validation_of(settings), generator)
         self.spare, self.left_out = nn.ModuleList(), nn.ModuleList()
@@ -263,7 +265,7 @@ class CombinedPrior(MixturePrior):
         Raises:
             ValueError: plans of other actions or contexts than this prior's, or without any action.
         """
-        plans, learned = self.known_plans(plans), None if learned is None else self.known_plans(learned)
+        plans, learned = known_plans(self, plans), None if learned is None else known_plans(self, learned)
         experts = list(self.alternatives)
         held_out, kept, powers = chosen_on(plans, learned, experts, (tried or len(experts)) + 2)
         actions, mask = held_out.actions, held_out.mask
@@ -288,7 +290,7 @@ class CombinedPrior(MixturePrior):
         self.first = held_out.initial_weights(taken.sum(1)).float()
 
     def recount(self, plans: Plans) -> Self:
-        plans, counted = self.counted_plans(plans), []
+        plans, counted = counted_plans(self, plans), []
         for e in priors_in(self.spare):
             try:
                 counted.append(e.recount(plans))

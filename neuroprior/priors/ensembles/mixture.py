@@ -10,8 +10,10 @@ from neuroprior._checks import check_alike_named, check_share
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import check_alike, fair_split, ungrouped
+from neuroprior.priors.construction import as_prior, described
 from neuroprior.priors.ensembles.stacked import context_for
-from neuroprior.priors.prior import Prior, as_prior, described, taken_of
+from neuroprior.priors.learning import counted_plans, known_plans, training_plans, validation_plans
+from neuroprior.priors.prior import Prior, taken_of
 from neuroprior.sampling.states import State
 
 SHARES = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
@@ -152,7 +154,7 @@ class MixturePrior(Prior):
             ValueError: plans that the experts cannot learn from, too few of them, or a setting that no expert has.
         """
         self.check_settings(settings)
-        plans = self.training_plans(plans)
+        plans = training_plans(self, plans)
         generator = generator_on(generator, "cpu")
         learned, held_out = divided(plans, self._validation_of(settings), generator)
         self.fit_experts(learned, held_out, generator, settings)
@@ -162,7 +164,7 @@ class MixturePrior(Prior):
     def _validation_of(self, settings: dict[str, Any]) -> Plans | float | None:
         """What is held out, which is taken from the settings of `fit`: as plans that this prior can predict."""
         given: Plans | float | None = settings.pop("validation", None)
-        return self.validation_plans(given) if isinstance(given, Plans) else given
+        return validation_plans(self, given) if isinstance(given, Plans) else given
 
     def fit_experts(
         self, learned: Plans, held_out: Plans, generator: torch.Generator, settings: Mapping[str, Any]
@@ -174,7 +176,7 @@ class MixturePrior(Prior):
             expert.fit(learned, generator=generator, **known)
 
     def recount(self, plans: Plans) -> Self:
-        plans = self.counted_plans(plans)
+        plans = counted_plans(self, plans)
         for expert in self._experts():
             expert.recount(plans)
         return self
@@ -186,7 +188,7 @@ class MixturePrior(Prior):
         Raises:
             ValueError: plans of other actions or contexts than this prior's, or without any action.
         """
-        plans = self.known_plans(plans)
+        plans = known_plans(self, plans)
         taken = taken_of(self._forecasts(plans.actions, plans.context), plans.actions)
         self.first, self.share = learned_weights(taken, plans.mask())
 

@@ -12,6 +12,7 @@ from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, in_parts, num_units
 from neuroprior.priors.counts import ContextTreePrior, HistoryPrior, MarkovPrior
+from neuroprior.priors.learning import counted_plans, training_plans, validation_plans
 from neuroprior.priors.neural.gru import gru_sequence
 from neuroprior.priors.neural.neural import NeuralPrior, Sizes, context_embedding
 from neuroprior.priors.prior import Prior
@@ -142,10 +143,6 @@ class StackedPrior(Prior):
     def fit_settings(self) -> tuple[str, ...]:
         return self.mixer.fit_settings
 
-    @property
-    def learns_anew(self) -> bool:
-        return self.mixer.learns_anew
-
     def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Fit the experts by counting and the network with Lightning; returns self.
 
@@ -161,8 +158,8 @@ class StackedPrior(Prior):
         """
         self.check_settings(settings)
         held_out = settings.get("validation")
-        held_out = self.validation_plans(held_out) if isinstance(held_out, Plans) else None
-        plans = self.training_plans(plans)
+        held_out = validation_plans(self, held_out) if isinstance(held_out, Plans) else None
+        plans = training_plans(self, plans, further=self.mixer.sized)
         generator = generator_on(generator, "cpu")
         learned = plans[plans.mask().any(1)]
         if len(learned) == 1:
@@ -186,7 +183,7 @@ class StackedPrior(Prior):
         return replace(plans, context=features, context_names=None)
 
     def recount(self, plans: Plans) -> Self:
-        plans = self.counted_plans(plans)
+        plans = counted_plans(self, plans)
         for expert in self._experts():
             expert.fit(plans)
         return self

@@ -9,8 +9,10 @@ from torch import Tensor
 from neuroprior._checks import check_sizes
 from neuroprior._hashing import row_hashes
 from neuroprior.plans import Plans
+from neuroprior.priors.construction import as_prior, described
+from neuroprior.priors.learning import training_plans
 from neuroprior.priors.macros.macros import CRITERIA, Criterion, Macro, macros_of
-from neuroprior.priors.prior import Prior, as_prior, described
+from neuroprior.priors.prior import Prior
 from neuroprior.sampling.states import State, join_rows, map_state, select_rows, tensors_in
 
 
@@ -114,7 +116,7 @@ class MacroPrior(Prior):
         given = plans if isinstance(plans, Plans) else Plans(torch.as_tensor(plans), self.num_actions)
         held_out = [some for some in (settings.get("validation"),) if isinstance(some, Plans)]
         macros, recoded = macros_of(given, self.num_macros, self.by, *held_out)  # raises before anything is changed
-        self.training_plans(given)
+        training_plans(self, given)
         settings |= {"validation": recoded[1]} if held_out else {}
         self._inner().fit(recoded[0], generator=generator, **settings)
         self._set_macros(macros)

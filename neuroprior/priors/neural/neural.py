@@ -11,6 +11,7 @@ from neuroprior._checks import check_count, check_memory, check_seed, check_size
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import check_alike
+from neuroprior.priors.learning import training_plans, validation_plans
 from neuroprior.priors.neural import cuda_graphs as recordings
 from neuroprior.priors.neural.features import Standardise
 from neuroprior.priors.prior import Prior
@@ -125,7 +126,7 @@ class NeuralPrior(Prior):
         self._given_window = self.window = window
         check_sizes(lags=1 if lags is None else lags)
         self._given = (width, lags, dropout, num_layers)
-        self._seed, self._sized = seed, False
+        self._seed, self.sized = seed, False
         self.input_size = 1 + (1 if num_contexts is not None else context_size or 0)
         self._make(Sizes())
 
@@ -145,13 +146,13 @@ class NeuralPrior(Prior):
 
     def arguments(self) -> dict[str, Any]:
         """The sizes, by name; before it learns, which chooses what was not given, as they were given, and the seed."""
-        if self._sized:
+        if self.sized:
             return {name: getattr(self, name) for name in Sizes._fields}
         return dict(zip(Sizes._fields, self._given, strict=True)) | {"seed": self._seed}
 
     @property
     def learned(self) -> dict[str, Any]:
-        sizes = [self.width, self.lags, self.dropout, self.num_layers] if self._sized else None
+        sizes = [self.width, self.lags, self.dropout, self.num_layers] if self.sized else None
         return super().learned | {"window": self.window, "sizes": sizes}
 
     def restore(self, learned: dict[str, Any]) -> None:
@@ -162,13 +163,9 @@ class NeuralPrior(Prior):
         self.window = window
         sizes = learned.get("sizes")
         if sizes is not None:
-            self._sized = True  # to `fit` again goes on from the weights that are loaded next
+            self.sized = True  # to `fit` again goes on from the weights that are loaded next
             if None in self._given:
                 self._make(Sizes(*sizes))
-
-    @property
-    def learns_anew(self) -> bool:
-        return not self._sized
 
     def sizes_for(self, plans: Plans) -> Sizes:
         """What is chosen for plans to learn from, where it was not given."""
@@ -326,8 +323,8 @@ class NeuralPrior(Prior):
 
         how = Settings(**settings)
         if isinstance(how.validation, Plans):  # refused before anything is kept of the plans
-            validation = self.validation_plans(how.validation)
-            check_alike(self.validation_plans(self._as_plans(plans)), validation)
+            validation = validation_plans(self, how.validation)
+            check_alike(validation_plans(self, self.as_plans(plans)), validation)
             how = replace(how, validation=validation)
         plans = self.prepare(plans, how.window)
         train(self, plans, how, draw_seed(generator_on(generator, "cpu")))
@@ -341,17 +338,17 @@ class NeuralPrior(Prior):
         Raises:
             ValueError: plans that this prior cannot learn from, or too few of them.
         """
-        plans = self.training_plans(plans)
+        plans = training_plans(self, plans, further=self.sized)
         plans = plans[plans.mask().any(1)]
-        if None in self._given and not self._sized:
+        if None in self._given and not self.sized:
             self._make(self.sizes_for(plans))
-        for module in () if self._sized else self.modules():
+        for module in () if self.sized else self.modules():
             if isinstance(module, Standardise):
                 module.learn_from(plans)
         lengths = plans.mask().sum(1)
         if len(plans) < 2 and int(lengths.sum()) < 2:
             raise ValueError("plans: a neural prior needs at least two actions to learn from, beside those held out")
-        self._sized = True
+        self.sized = True
         longest = int(lengths.max())
         self.set_training_window(window if longest > window else None)
         if longest <= window and self._given_window is None:

@@ -13,6 +13,7 @@ from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.counts.histories import Counts, Tree
 from neuroprior.priors.counts.history_prior import HistoryPrior
+from neuroprior.priors.learning import counted_plans, training_plans
 from neuroprior.priors.prior import taken_of
 from neuroprior.priors.switching.forward_backward import TINY, Smoothed, most_probable_path, predict, smooth
 from neuroprior.priors.switching.mode_chains import ModeChains
@@ -271,7 +272,7 @@ class SwitchingPrior(HistoryPrior):
             ValueError: plans that this prior cannot learn from, an unknown setting, or too many histories.
         """
         self.check_settings(settings)
-        plans, generator = self.training_plans(plans), generator_on(generator, self.device)
+        plans, generator = training_plans(self, plans), generator_on(generator, self.device)
         if plans.actions.numel() == 0:
             self.learn(*self.count(plans))
             return self
@@ -296,7 +297,7 @@ class SwitchingPrior(HistoryPrior):
         generator, known = torch.Generator(self.device).manual_seed(0), bool(len(self.row_code))
         if not known:
             return self.fit(plans, generator=generator)
-        return self._go_on(self.counted_plans(plans), generator, SHORT_RUN)
+        return self._go_on(counted_plans(self, plans), generator, SHORT_RUN)
 
     @torch.no_grad()
     def _go_on(self, plans: Plans, generator: torch.Generator, iterations: int) -> Self:
@@ -316,8 +317,8 @@ class SwitchingPrior(HistoryPrior):
         Raises:
             ValueError: other actions or another context than this prior's.
         """
-        plans = self._as_plans(plans)
-        self._check_scored(plans)
+        plans = self.as_plans(plans)
+        self.check_plans(plans)
         if plans.actions.numel() == 0:
             none = self.first.new_zeros(*plans.actions.shape, self.num_modes)
             return ModePosterior(none, none, none[..., 0].long())

@@ -9,6 +9,7 @@ from torch import Tensor
 from neuroprior._checks import check_range, check_sizes, is_integer
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans, check_patterns
+from neuroprior.priors.learning import training_plans
 from neuroprior.priors.prior import Prior
 from neuroprior.puzzles.priors.compiled_fit import epoch, frequent, number_patterns
 
@@ -123,7 +124,7 @@ class LogLinearPrior(Prior):
             ValueError: plans without such a context, or without any action, or an unknown setting.
         """
         self.check_settings(settings)
-        return self.fit_steps(Steps.of(self.training_plans(plans)), generator=generator, **settings)
+        return self.fit_steps(Steps.of(training_plans(self, plans)), generator=generator, **settings)
 
     def fit_steps(
         self,
