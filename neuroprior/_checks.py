@@ -53,7 +53,7 @@ def precision_lost(values: Tensor, std: Tensor) -> list[int]:
 def check_range(name: str, values: Tensor, stop: int, what: str) -> None:
     """Raise ValueError unless `values` are integers from 0 to `stop` - 1; the message names the first that is not."""
     if not is_integer(values):
-        raise ValueError(f"{name}: integers are expected, not {str(values.dtype).removeprefix('torch.')}")
+        raise ValueError(f"`{name}` must be integers, got {str(values.dtype).removeprefix('torch.')}")
     if values.numel() == 0:
         return
     # torch cannot compare the wider unsigned types.
@@ -83,7 +83,7 @@ def as_list(name: str, values: Any) -> list[Any]:
     """A list of the values, numpy's and torch's as Python's numbers; raises ValueError for a single one."""
     found = values.tolist() if hasattr(values, "tolist") else values
     if not isinstance(found, Iterable) or isinstance(found, str):
-        raise ValueError(f"{name}: a list of numbers is expected, not {values!r}")
+        raise ValueError(f"`{name}` must be a list of numbers, got {values!r}")
     return [one.item() if hasattr(one, "item") else one for one in found]
 
 
@@ -91,13 +91,13 @@ def check_sizes(**sizes: object) -> None:
     """Raise ValueError, naming the argument, unless all are integers of at least 1."""
     for name, size in sizes.items():
         if not isinstance(size, int) or isinstance(size, bool) or size < 1:
-            raise ValueError(f"{name}: an integer of at least 1 is expected, not {size!r}")
+            raise ValueError(f"`{name}` must be an integer of at least 1, got {size!r}")
 
 
 def check_count(name: str, count: object, bytes_each: int = 8) -> None:
     """Raise ValueError, naming the argument, unless it is an integer of at least 0 that fits in memory."""
     if not isinstance(count, int) or isinstance(count, bool) or count < 0:
-        raise ValueError(f"{name}: an integer of at least 0 is expected, not {count!r}")
+        raise ValueError(f"`{name}` must be an integer of at least 0, got {count!r}")
     check_memory(bytes_each * count, **{name: count})
 
 
@@ -109,20 +109,20 @@ def is_number(value: object) -> TypeGuard[float]:
 def check_seed(seed: object) -> None:
     """Raise ValueError unless it is an integer that torch takes as a seed."""
     if not isinstance(seed, int) or isinstance(seed, bool) or not -(2**63) <= seed < 2**63:
-        raise ValueError(f"seed: an integer from -2**63 to 2**63 - 1 is expected, not {seed!r}")
+        raise ValueError(f"`seed` must be an integer from -2**63 to 2**63 - 1, got {seed!r}")
 
 
 def check_flags(**flags: object) -> None:
     """Raise ValueError, naming the argument, unless all are True or False."""
     for name, flag in flags.items():
         if not isinstance(flag, bool | np.bool_):
-            raise ValueError(f"{name}: True or False is expected, not {flag!r}")
+            raise ValueError(f"`{name}` must be True or False, got {flag!r}")
 
 
 def check_share(name: str, share: object) -> None:
     """Raise ValueError, naming the argument, unless it is a number from 0 to 1."""
     if not is_number(share) or not 0 <= share <= 1:
-        raise ValueError(f"{name}: a number from 0 to 1 is expected, not {share!r}")
+        raise ValueError(f"`{name}` must be a number from 0 to 1, got {share!r}")
 
 
 def check_same_names(
@@ -163,7 +163,7 @@ def check_alike_named(named: Mapping[str, Sequence[str] | None], remedy: str, wh
 def check_level(level: object) -> None:
     """Raise ValueError unless it is a level of confidence: a number above 0 and below 1."""
     if not is_number(level) or not 0 < level < 1:
-        raise ValueError(f"level: a number above 0 and below 1, such as 0.95, is expected, not {level!r}")
+        raise ValueError(f"`level` must be a number above 0 and below 1, such as 0.95, got {level!r}")
 
 
 def check_memory(needed: int, **arguments: object) -> None:

@@ -192,7 +192,9 @@ def _on_cluster(call: Callable[..., tuple[int, Any]], jobs: Sequence[Any], addre
     try:
         client = Client(address, timeout=SCHEDULER_SECONDS)
     except (OSError, ValueError) as error:
-        raise ValueError(f"dask: no scheduler answers at {address!r}; tcp://host:8786, say, is expected") from error
+        raise ValueError(
+            f"`dask` must be the address of a scheduler, such as tcp://host:8786; none answers at {address!r}"
+        ) from error
     with client, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Sending large graph")  # each job has what all need, in case workers go
         # Before there are workers: a cluster that grows with its tasks has none yet.

@@ -25,7 +25,7 @@ def generator_on(generator: torch.Generator | None, device: torch.device | str) 
         return fresh
     if not isinstance(generator, torch.Generator):
         raise ValueError(
-            f"generator: a torch.Generator is expected, such as torch.Generator().manual_seed(0), not {generator!r}"
+            f"`generator` must be a torch.Generator, such as torch.Generator().manual_seed(0), got {generator!r}"
         )
     if generator.device.type == device.type:
         return generator

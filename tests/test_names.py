@@ -161,7 +161,7 @@ def test_a_forecast_is_of_the_priors_that_were_inferred():
     posterior = infer(priors, PLANS[:2])
     state, targets = torch.tensor([0, 5]), torch.tensor([1])
     assert forecast(priors, WORLD, state, posterior, 2, 5, targets=targets).shape == (2, 1)
-    with pytest.raises(ValueError, match=r"^posterior: that of the priors b, a is expected, not of a, b"):
+    with pytest.raises(ValueError, match=r"^`posterior` must be that of the priors b, a"):
         forecast(dict(reversed(priors.items())), WORLD, state, posterior, 2, 5, targets=targets)
     for wrong in (16, -1):
         with pytest.raises(ValueError, match=f"{wrong} is out of range"):

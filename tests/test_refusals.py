@@ -39,7 +39,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "groups of others": (lambda: vectors(group=torch.tensor([1])), "group"),
     "a name for names": (lambda: vectors(action_names="torque"), "`action_names` must be a list"),
     "context of others": (lambda: vectors(context=torch.zeros(5, 2)), "context"),
-    "steps before the first": (lambda: vectors().steps(-1), "first: an integer of at least 0 is expected, not -1"),
+    "steps before the first": (lambda: vectors().steps(-1), "`first` must be an integer of at least 0, got -1"),
     "lengths that are words": (lambda: vectors(lengths=["long", "short"]), "`lengths` must be numbers"),
     "plans that are none": (lambda: write_vector_plans(Plans(ZEROS, 1), "x.npz"), "VectorPlans"),
     "vectors in CSV": (lambda: write_vector_plans(vectors(), "x.csv"), ".npz"),
@@ -183,9 +183,9 @@ def test_plans_that_are_numbered_otherwise_are_not_counted_in_again(make) -> Non
         prior.recount(named("cba"))
     with refuses("context_names", "R, L", "L, R"):
         prior.recount(named(contexts="RL"))
-    with refuses("3 actions are expected", "not 4"):
+    with refuses("3 actions", "got 4"):
         prior.recount(named(end=True))
-    with refuses("at least one with an action"):
+    with refuses("at least one plan with an action"):
         prior.recount(named().steps(0, 0))
     assert prior.log_prob(named()).equal(before)
     assert prior.recount(named()).log_prob(named()).isfinite().all()
@@ -221,14 +221,14 @@ def test_validation_plans_are_refused_before_anything_is_learned(kind) -> None:
     plans, prior = named(), kind(3, [MarkovPrior(3, 1, num_contexts=2)], num_contexts=2)
     with refuses("validation: context_names", "R, L"):
         prior.fit(plans, validation=named(contexts="RL"))
-    with refuses("validation: at least one plan with an action"):
+    with refuses("`validation` must have at least one plan with an action"):
         prior.fit(plans, validation=plans.steps(0, 0))
 
 
 def test_an_end_is_that_of_the_plans_that_were_learned_from() -> None:
     plans = Plans(torch.randint(2, (20, 4), generator=seeded(0)), 3)
     prior = MixturePrior(3, [UniformPrior(3), MarkovPrior(3, 1)]).fit(plans, generator=seeded(0))
-    with refuses("end=None is expected", "not 2"):
+    with refuses("end=None", "got 2"):
         prior.recount(replace(plans, end=2))
 
 
@@ -240,9 +240,9 @@ def test_weights_are_learned_from_plans_that_are_known(kind) -> None:
     with refuses("action_names", "b, a"):
         prior.learn_weights(replace(plans, action_names=("b", "a")))
     for none in (plans[:0], plans.steps(0, 0)):
-        with refuses("at least one with an action"):
+        with refuses("at least one plan with an action"):
             prior.learn_weights(none)
-    with refuses("2 actions are expected", "5"):
+    with refuses("must have 2 actions", "5"):
         prior.learn_weights(Plans(torch.zeros(3, 4, dtype=torch.long), 5))
 
 

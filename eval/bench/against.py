@@ -50,8 +50,8 @@ def compared(before: Mapping[str, Any], now: Mapping[str, Any]) -> pd.DataFrame:
     for name in ("scale", "threads"):
         if before["settings"].get(name) != now["settings"].get(name):
             raise ValueError(
-                f"against: measured with {name} {before['settings'].get(name)}, not {now['settings'].get(name)};"
-                " the same is expected"
+                f"`against` must be measured with {name} {now['settings'].get(name)}, as these results,"
+                f" got {before['settings'].get(name)}"
             )
     rows = []
     for part, names in KEYS.items():
@@ -61,7 +61,7 @@ def compared(before: Mapping[str, Any], now: Mapping[str, Any]) -> pd.DataFrame:
             if key in earlier:
                 rows.append(_row(": ".join(map(str, key)) or "from neuroprior import *", part, earlier[key], row))
     if not rows:
-        raise ValueError("against: results of the same measurements are expected; the two have none in common")
+        raise ValueError("`against` must have measurements in common with these results, got none")
     return pd.DataFrame(rows)
 
 

@@ -58,9 +58,9 @@ def bench(
         Console().print(_regressions(earlier, read_results(measured), against))
         return
     for name in set(jobs) - set(JOBS):
-        raise ValueError(f"jobs: some of {', '.join(JOBS)} are expected, not {name}")
+        raise ValueError(f"`jobs` must be some of {', '.join(JOBS)}, got {name}")
     if not 0 < scale <= 1:
-        raise ValueError(f"scale: a number above 0 and at most 1 is expected, not {scale}")
+        raise ValueError(f"`scale` must be a number above 0 and at most 1, got {scale}")
     console, folder = Console(), Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     settings = {"repetitions": repetitions, "scale": scale, "threads": torch.get_num_threads()}

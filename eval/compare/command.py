@@ -79,7 +79,7 @@ def compare(
     saved = tuple(priors or ())
     fitted = tuple(([] if saved else KINDS) if kinds is None else kinds)
     if not fitted and not saved:
-        raise ValueError("kinds: at least one kind of prior, or --priors, is expected")
+        raise ValueError("`kinds` must have at least one prior, unless there are --priors")
     check_distinct(worlds=worlds, num_plans=num_plans)
     more = {"priors": saved, "kinds": fitted, "context": tuple(context or ())}
     check_distinct(**{name: given for name, given in more.items() if given})

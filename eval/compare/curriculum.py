@@ -62,11 +62,11 @@ def curriculum(
     check_contexts(worlds, context)
     longer = tuple(lengths or ())
     if list(longer) != sorted(set(longer)):
-        raise ValueError(f"lengths: each longer than the one before is expected, not {' '.join(map(str, longer))}")
+        raise ValueError(f"`lengths` must each be longer than the one before, got {' '.join(map(str, longer))}")
     for world in worlds:
         if longer and longer[0] <= TASKS[world].depth:
             depth = TASKS[world].depth
-            raise ValueError(f"lengths: more than {depth} is expected first: in {world} all plans of {depth} are tried")
+            raise ValueError(f"`lengths` must begin above {depth}: in {world} all plans of {depth} are tried")
     how = (tuple(kinds), tuple(context), len(longer) or ROUNDS, steps, starts, training_starts, seed)
     settings = Settings((num_plans,), *how, lengths=longer)
     runs.run_experiment(

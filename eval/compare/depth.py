@@ -61,10 +61,10 @@ def depth(
     """
     runs.check_distinct(worlds=worlds, num_plans=num_plans)
     if length < 2:
-        raise ValueError(f"length: a power of two from 2 is expected, not {length}")
+        raise ValueError(f"`length` must be a power of two from 2, got {length}")
     for world in worlds:
         if TASKS[world].worlds(0).held_out.stochastic:
-            raise ValueError(f"worlds: deterministic ones are expected, not {world}")
+            raise ValueError(f"`worlds` must be deterministic ones, got {world}")
     settings = DepthSettings(tuple(num_plans), ("markov",), (), 9, 1, starts, training_starts, seed, length=length)
     report = partial(planner_document, baseline=CHOSEN, title="How deep to plan")
     runs.run_experiment("depth", depth_run, report, settings, worlds, seeds, out, processes, dask)

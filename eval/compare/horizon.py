@@ -77,7 +77,7 @@ class HorizonPlanner(SamplingPlanner):
         )
         check_sizes(rounds=rounds)
         if not is_number(pilot) or not 0 < pilot <= 1:
-            raise ValueError(f"pilot: a share above 0 and at most 1 is expected, not {pilot!r}")
+            raise ValueError(f"`pilot` must be a share above 0 and at most 1, got {pilot!r}")
         self.first = max(round(pilot * num_plans), 1)
         self.rounds = min(rounds, num_plans - self.first)
 

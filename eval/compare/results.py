@@ -88,7 +88,7 @@ class Results:
 
     def __post_init__(self) -> None:
         if not self.runs:
-            raise ValueError("runs: at least one is expected; without any there is nothing to compare")
+            raise ValueError("`runs` must have at least one run to compare")
         runs = sorted(self.runs, key=lambda run: (self.worlds.index(run["world"]), int(run["seed"])))
         object.__setattr__(self, "runs", runs)
         object.__setattr__(self, "num_plans", sorted(self.num_plans))

@@ -64,7 +64,7 @@ def intentions(
     for name, given in (("observed", observed), ("ahead", ahead), ("goals", [goals]), ("num_plans", num_plans)):
         low, high = limits[name]
         if wrong := [number for number in given if not low <= number <= high]:
-            raise ValueError(f"{name}: integers from {low} to {high} are expected, not {wrong[0]}")
+            raise ValueError(f"`{name}` must be integers from {low} to {high}, got {wrong[0]}")
     if LABYRINTH in worlds and seeds > BLOCKS:
         raise ValueError(f"seeds: in the {LABYRINTH} at most {BLOCKS}, the blocks of sequences, not {seeds}")
     numbers, times, later = (tuple(sorted(given)) for given in (num_plans, observed, ahead))

@@ -57,7 +57,7 @@ def live(
     runs.check_distinct(worlds=worlds, kinds=kinds)
     whole = max(*LEARN_EVERY.values(), PARTS * REPLAN_EVERY)
     if period % whole:
-        raise ValueError(f"period: a multiple of {whole} is expected, not {period}")
+        raise ValueError(f"`period` must be a multiple of {whole}, got {period}")
     settings = LiveSettings(tuple(kinds), period, seasons, agents, items, num_plans, length, seed)
     document = runs.run_experiment("live", run_live, live_document, settings, worlds, seeds, out, processes, dask)
     write_figures(Path(out), {box.name: box.figure for box in document.sections[0].figures})

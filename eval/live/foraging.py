@@ -46,19 +46,19 @@ class ForagingWorld(World):
     def __init__(self, table: TabularWorld, growth: Tensor, period: int, num_items: int = 4) -> None:
         check_sizes(period=period, num_items=num_items)
         if not isinstance(table, TabularWorld):
-            raise ValueError(f"table: a TabularWorld is expected, not a {type(table).__name__}")
+            raise ValueError(f"`table` must be a TabularWorld, got {type(table).__name__}")
         if table.num_layouts > 1:
-            raise ValueError(f"table: one layout is expected, not {table.num_layouts}")
+            raise ValueError(f"`table` must have one layout, got {table.num_layouts}")
         self.place = places(table)
         self.num_places = int(self.place.max()) + 1
         growth = torch.as_tensor(growth, device=table.device)
         if growth.dim() != 2 or growth.shape[1] != self.num_places or not growth.is_floating_point() or not len(growth):
             raise ValueError(
-                f"growth: floating point of shape [E, {self.num_places}] is expected,"
-                f" not {str(growth.dtype).removeprefix('torch.')} of shape {list(growth.shape)}"
+                f"`growth` must be floating point of shape [E, {self.num_places}],"
+                f" got {str(growth.dtype).removeprefix('torch.')} of shape {list(growth.shape)}"
             )
         if not growth.isfinite().all() or (growth < 0).any() or (growth.sum(1) <= 0).any():
-            raise ValueError("growth: finite numbers of at least 0 are expected, in each season one above it")
+            raise ValueError("`growth` must be finite numbers of at least 0, in each season one above it")
         self.table, self.growth, self.period, self.num_items = table, growth, period, num_items
         self.num_actions, self.action_names = table.num_actions, table.action_names
         self.all_legal, self.stochastic = table.all_legal, table.stochastic
@@ -104,13 +104,13 @@ class ForagingWorld(World):
     def check_state(self, state: Tensor) -> None:
         super().check_state(state)
         if state.dim() != 2 or state.shape[1] != 2 + self.num_items:
-            raise ValueError(f"state: shape [B, {2 + self.num_items}] is expected, not {list(state.shape)}")
+            raise ValueError(f"`state` must have shape [B, {2 + self.num_items}], got {list(state.shape)}")
         if state.dtype != torch.int64:
-            raise ValueError(f"state: int64 is expected, not {str(state.dtype).removeprefix('torch.')}")
+            raise ValueError(f"`state` must be int64, got {str(state.dtype).removeprefix('torch.')}")
         check_range("state[:, 0]", state[:, 0], self.table.num_states, "cells")
         check_range("state[:, 2:]", state[:, 2:], self.num_places + 1, "places, nowhere among them")
         if (state[:, 1] < 0).any():
-            raise ValueError("state[:, 1]: a time of at least 0 is expected")
+            raise ValueError("`state[:, 1]` must be a time of at least 0")
 
 
 def places(table: TabularWorld) -> Tensor:
@@ -140,7 +140,7 @@ def patches(table: TabularWorld, num_seasons: int, radius: int, generator: torch
     """
     check_sizes(num_seasons=num_seasons, radius=radius)
     if table.stochastic:
-        raise ValueError("table: a deterministic one is expected")
+        raise ValueError("`table` must be a deterministic one")
     generator = generator_on(generator, table.device)
     reached = torch.zeros(num_seasons, table.num_states, device=table.device)
     reached.scatter_(1, table.cell(table.reset(num_seasons, generator))[:, None], 1.0)

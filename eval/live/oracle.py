@@ -44,7 +44,7 @@ class ForagingOracle(Planner):
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
         if not isinstance(world, ForagingWorld) or world.stochastic or world.num_items > MOST_ITEMS:
-            raise ValueError(f"world: a deterministic ForagingWorld of at most {MOST_ITEMS} items is expected")
+            raise ValueError(f"`world` must be a deterministic ForagingWorld of at most {MOST_ITEMS} items")
         world.check_state(state)
         generator = generator_on(generator, state.device)
         work = self.length * 2**world.num_items * world.table.num_states * world.num_actions

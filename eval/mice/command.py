@@ -57,7 +57,7 @@ def mice(
         out: folder to write to.
     """
     if seeds < 2:
-        raise ValueError(f"seeds: at least 2 are expected, for intervals, not {seeds}")
+        raise ValueError(f"`seeds` must be at least 2, for intervals, got {seeds}")
     check_fits(starts, lengths)
     check_distinct(num_plans=num_plans, lengths=lengths)
     settings = MiceSettings(seeds, starts, tuple(num_plans), tuple(lengths), training_plans, steps, seed)

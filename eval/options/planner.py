@@ -43,7 +43,7 @@ class OptionPlanner(SamplingPlanner):
         self, prior: SwitchingPrior, length: int, num_plans: int, *, terminations: bool = True, **how: Any
     ) -> None:
         if not isinstance(prior, SwitchingPrior):
-            raise ValueError(f"prior: a SwitchingPrior is expected, not {type(prior).__name__}")
+            raise ValueError(f"`prior` must be a SwitchingPrior, got {type(prior).__name__}")
         super().__init__(prior, length, num_plans, **how)
         self.options, self.terminations = prior, terminations
 

@@ -43,7 +43,7 @@ def pages(stages: Sequence[str] = tuple(HOURS), listing: bool = False, out: str 
         out: folder for `PAGE-NUMBER.txt`, what a command printed, and the folder `PAGE-NUMBER` of its files.
     """
     for name in set(stages) - set(HOURS):
-        raise ValueError(f"stages: some of {', '.join(HOURS)} are expected, not {name}")
+        raise ValueError(f"`stages` must be some of {', '.join(HOURS)}, got {name}")
     folder = Path(out)
     steps = {name: commands(DOCS / f"{name}.md") for name in stages}
     for name, found in steps.items():

@@ -78,7 +78,7 @@ def paper(
     settings = dict(locals())
     for name in ("size", "value_functions"):
         if settings[name] < 2:
-            raise ValueError(f"{name}: an integer of at least 2 is expected, not {settings[name]}")
+            raise ValueError(f"`{name}` must be an integer of at least 2, got {settings[name]}")
     own = PaperSettings(**{name: value for name, value in settings.items() if name not in ("protocols", "out")})
     folder, console = Path(out), Console()
     folder.mkdir(parents=True, exist_ok=True)

@@ -251,7 +251,7 @@ def _standardised(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def _require(holds: bool, name: str, wanted: str, given: object) -> None:
     if not holds:
-        raise ValueError(f"{name}: {wanted} is expected, not {given!r}")
+        raise ValueError(f"`{name}` must be {wanted}, got {given!r}")
 
 
 def _check_fit(values: Tensor, coordinates: Tensor) -> None:
@@ -261,4 +261,4 @@ def _check_fit(values: Tensor, coordinates: Tensor) -> None:
     _require(fits, "coordinates", f"shape [S, D] with S = {values.shape[1]}", list(coordinates.shape))
     for name, tensor in (("values", values), ("coordinates", coordinates)):
         for where in (~tensor.isfinite()).nonzero().tolist()[:1]:
-            raise ValueError(f"{name}{where}: a finite number is expected, not {tensor[tuple(where)]}")
+            raise ValueError(f"`{name}{where}` must be a finite number, got {tensor[tuple(where)]}")

@@ -163,7 +163,7 @@ def quality(
     if 0 < num_plans < 100 or held_out < 100:
         raise ValueError(f"num_plans and held_out: at least 100 are needed, not {num_plans} and {held_out}")
     if not num_plans and not num_sequences:
-        raise ValueError("num_plans and num_sequences: one of them above 0 is expected")
+        raise ValueError("`num_plans` or `num_sequences` must be above 0")
     generator = torch.Generator().manual_seed(seed)
     number = len(sequences(num_sequences, torch.Generator().manual_seed(seed)))
     asked = {"command": "quality", "num_sequences": num_sequences}

@@ -43,7 +43,7 @@ def sequences(number: int, generator: torch.Generator) -> list[Sequences]:
         return []
     held_out, parts = -(-number // 2), text(generator)
     if number + held_out > len(parts):
-        raise ValueError(f"num_sequences: at most {len(parts) * 2 // 3} are expected, not {number}")
+        raise ValueError(f"`num_sequences` must be at most {len(parts) * 2 // 3}, got {number}")
     table = switching_chain(generator)
     (learned, _), (test, log_probs) = (draw(table, size, generator) for size in (number, held_out))
     return [

@@ -29,7 +29,7 @@ def check_fits(starts: int, lengths: Sequence[int]) -> None:
     """Raise ValueError unless there are so many nodes to start from, and sequences of such lengths."""
     for name, most_asked, most in (("starts", starts, NODES), ("lengths", max(lengths), LONGEST)):
         if most_asked > most:
-            raise ValueError(f"{name}: integers from 1 to {most} are expected, not {most_asked}")
+            raise ValueError(f"`{name}` must be integers from 1 to {most}, got {most_asked}")
 
 
 def dry_nodes(world: TabularWorld) -> Tensor:

@@ -118,7 +118,7 @@ def check_distinct(**options: Sequence[Any]) -> None:
     """Raise ValueError, naming the option, where a list is empty or holds something twice."""
     for name, given in options.items():
         if not given:
-            raise ValueError(f"{name}: at least one is expected")
+            raise ValueError(f"`{name}` must have at least one")
         if len(set(given)) < len(given):
             raise ValueError(f"{name}: each may be given once, not {' '.join(map(str, given))}")
 

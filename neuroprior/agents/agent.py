@@ -86,22 +86,22 @@ class Agent:
         check_is_planner(planner)
         check_change(change)
         if not isinstance(training, Mapping | None):
-            raise ValueError(f"training: a dictionary of settings is expected, not {training!r}")
+            raise ValueError(f"`training` must be a dictionary of settings, got {training!r}")
         check_is_prior(prior)
         check_is_world(world)
         if plan_length % replan_every:
-            raise ValueError(f"plan_length: a multiple of replan_every = {replan_every} is expected, not {plan_length}")
+            raise ValueError(f"`plan_length` must be a multiple of replan_every = {replan_every}, got {plan_length}")
         if learn_every is not None and learn_every % plan_length:
-            raise ValueError(f"learn_every: a multiple of plan_length = {plan_length} is expected, not {learn_every}")
+            raise ValueError(f"`learn_every` must be a multiple of plan_length = {plan_length}, got {learn_every}")
         check_actions(prior, world)
         own, chooses = getattr(planner, "prior", None), isinstance(prior, CombinedPrior) and prior.given is None
         if chooses and own is not prior and any(own is e for e in prior.modules()):
             raise ValueError(
-                "planner: it samples from an expert of the prior, which fits others in its place when it learns; a"
-                " planner that samples from the prior itself is expected"
+                "`planner` must sample from the prior itself, got one that samples from an expert, in whose place"
+                " the prior fits others when it learns"
             )
         if min_score is not None and (not is_number(min_score) or min_score != min_score):
-            raise ValueError(f"min_score: a number is expected, not {min_score!r}")
+            raise ValueError(f"`min_score` must be a number, got {min_score!r}")
         self.generator = generator_on(generator, prior.device)
         self.state = world.reset(1, self.generator) if state is None else state
         world.check_state(self.state)
@@ -127,9 +127,7 @@ class Agent:
         check_sizes(num_steps=num_steps)
         check_memory(8 * num_steps, num_steps=num_steps)
         if num_steps % self.replan_every:
-            raise ValueError(
-                f"num_steps: a multiple of replan_every = {self.replan_every} is expected, not {num_steps}"
-            )
+            raise ValueError(f"`num_steps` must be a multiple of replan_every = {self.replan_every}, got {num_steps}")
         parts = []
         for _ in range(num_steps // self.replan_every):
             decision = self._decide()

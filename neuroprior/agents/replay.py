@@ -29,7 +29,7 @@ class Replay:
 
     def __init__(self, retention: float) -> None:
         if not is_number(retention) or not 0 < retention <= 1:
-            raise ValueError(f"retention: a probability above 0 and at most 1 is expected, not {retention!r}")
+            raise ValueError(f"`retention` must be a probability above 0 and at most 1, got {retention!r}")
         self.retention = retention
         self.plans: Plans | None = None
 
@@ -54,8 +54,8 @@ class Replay:
         before = self.plans
         if (before.num_actions, before.max_length) != (plans.num_actions, plans.max_length):
             raise ValueError(
-                f"plans: {before.max_length} steps of {before.num_actions} actions are expected, as in the stored"
-                f" plans, not {plans.max_length} of {plans.num_actions}"
+                f"`plans` must have {before.max_length} steps of {before.num_actions} actions, as the stored"
+                f" plans, got {plans.max_length} of {plans.num_actions}"
             )
         names = before.action_names, plans.action_names
         check_same_names("action_names", *names, "the plans", "the stored ones")

@@ -114,7 +114,7 @@ def expected_score(
     check_plans(plans, len(state), world.num_actions)
     batch, num_plans, length = plans.shape
     if length < 1:
-        raise ValueError("plans: at least one action is expected, not 0")
+        raise ValueError("`plans` must have at least one action, got 0")
     if lengths is None:
         lengths = torch.full((batch, num_plans), length, device=state.device)
     _check_lengths(lengths, plans.shape)
@@ -179,7 +179,7 @@ def _mean(share: Tensor, values: Tensor) -> Tensor:
 
 def _check_lengths(lengths: Tensor, shape: torch.Size) -> None:
     if lengths.shape != shape[:2]:
-        raise ValueError(f"lengths: shape [B, P] = {list(shape[:2])} is expected, not {list(lengths.shape)}")
+        raise ValueError(f"`lengths` must have shape [B, P] = {list(shape[:2])}, got {list(lengths.shape)}")
     check_range("lengths", lengths, shape[2] + 1, "lengths")
     if (lengths < 1).any():
         where = (lengths < 1).nonzero()[0].tolist()

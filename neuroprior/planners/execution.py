@@ -119,11 +119,11 @@ def collect(
         torch.Size([10, 3])
     """
     if (num_plans is None) == (state is None):
-        raise ValueError("num_plans, state: one of the two is expected, not both or neither")
+        raise ValueError("one of `num_plans` and `state` must be given, got both or neither")
     if context not in (None, "plan", "step"):
-        raise ValueError(f'context: "plan", "step" or None is expected, not {context!r}')
+        raise ValueError(f'`context` must be "plan", "step" or None, got {context!r}')
     if min_score is not None and not is_number(min_score):
-        raise ValueError(f"min_score: a number is expected, not {min_score!r}")
+        raise ValueError(f"`min_score` must be a number, got {min_score!r}")
     check_is_planner(planner)
     check_is_world(world)
     if state is None:
@@ -149,7 +149,7 @@ def collect(
     seen = None if context is None else world.observe(state[:1])
     if seen is not None and not is_per_plan(seen) and (context == "plan" or seen.dim() != 2):
         raise ValueError(
-            "observe: indices [N] or floating point features [N, C] are expected of a world; patterns [N, F] are a"
+            "`observe` must give indices [N] or floating point features [N, C]; patterns [N, F] are a"
             ' context per step (context="step")'
         )
     observed = world.observe(state) if context == "plan" else observations(world, before, context)
@@ -213,7 +213,7 @@ def executed_steps(world: World, before: Tensor) -> Tensor:
 def check_change(change: object) -> None:
     """Raise ValueError unless it is a function, or None."""
     if change is not None and not callable(change):
-        raise ValueError(f"change: a function of states and a generator is expected, not {change!r}")
+        raise ValueError(f"`change` must be a function of states and a generator, got {change!r}")
 
 
 def _changed(change: Change, state: Tensor, generator: torch.Generator | None) -> Tensor:
@@ -221,7 +221,7 @@ def _changed(change: Change, state: Tensor, generator: torch.Generator | None) -
     after: object = change(state, generator)
     if not isinstance(after, Tensor) or after.shape != state.shape or after.dtype != state.dtype:
         found = f"{after.dtype} {list(after.shape)}" if isinstance(after, Tensor) else kind_of(after)
-        raise ValueError(f"change: {state.dtype} {list(state.shape)}, states as given, are expected, not {found}")
+        raise ValueError(f"`change` must be {state.dtype} {list(state.shape)}, states as given, got {found}")
     return after
 
 

@@ -62,7 +62,7 @@ class FrontierPlanner(PriorPlanner):
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
         if world.stochastic:
-            raise ValueError("world: a deterministic one is expected: plans that reach the same state are merged")
+            raise ValueError("`world` must be deterministic: plans that reach the same state are merged")
         generator = self._check(world, state, generator)
         widths = self._widths(world.num_actions)
         steps = sum(widths)

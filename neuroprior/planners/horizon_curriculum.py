@@ -90,7 +90,7 @@ def extend_horizon(
     """
     lengths = as_list("lengths", lengths)
     if not all(isinstance(length, int) and length >= 1 for length in lengths):
-        raise ValueError(f"lengths: integers of at least 1 are expected, not {lengths}")
+        raise ValueError(f"`lengths` must be integers of at least 1, got {lengths}")
     temperatures, uniform_shares = as_tried(temperatures, uniform_shares)
     check_is_prior(prior)
     check_are_plans(plans)

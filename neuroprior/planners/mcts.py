@@ -65,12 +65,12 @@ class MCTSPlanner(PriorPlanner):
     ) -> None:
         super().__init__(prior, length, num_plans, temperature=temperature, **goal)
         if not is_number(exploration) or not 0 <= exploration < float("inf"):
-            raise ValueError(f"exploration: a finite number of at least 0 is expected, not {exploration!r}")
+            raise ValueError(f"`exploration` must be a finite number of at least 0, got {exploration!r}")
         self.exploration = exploration
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
         if world.stochastic:
-            raise ValueError("world: a deterministic one is expected: a node of the tree is one state")
+            raise ValueError("`world` must be deterministic: a node of the tree is one state")
         generator = self._check(world, state, generator)
         from neuroprior.planners import compiled_mcts
 

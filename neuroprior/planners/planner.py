@@ -77,7 +77,7 @@ class Planner(ABC):
     ) -> None:
         check_objective(objective, discount)
         if value is not None and not callable(value):
-            raise ValueError(f"value: a function of states [N, ...] is expected, not {value!r}")
+            raise ValueError(f"`value` must be a function of states [N, ...], got {value!r}")
         check_flags(any_prefix=any_prefix)
         self.objective, self.discount, self.value, self.any_prefix = objective, discount, value, any_prefix
 
@@ -173,7 +173,7 @@ class PriorPlanner(Planner):
         check_memory(num_plans * length, length=length, num_plans=num_plans)
         check_temperature(temperature)
         if not isinstance(prior, Steppable):
-            raise ValueError(f"prior: a prior with num_actions, start and step is expected, not {type(prior).__name__}")
+            raise ValueError(f"`prior` must be a prior with num_actions, start and step, got {type(prior).__name__}")
         self.prior, self.length, self.num_plans, self.temperature = prior, length, num_plans, temperature
 
     def _threads_for(self, num_plans: int) -> AbstractContextManager[None]:
@@ -194,7 +194,7 @@ def as_floats(rewards: Tensor) -> Tensor:
 def check_is_planner(planner: object) -> None:
     """Raise ValueError unless it is a `Planner`."""
     if not isinstance(planner, Planner):
-        raise ValueError(f"planner: a Planner is expected, not {kind_of(planner)}")
+        raise ValueError(f"`planner` must be a Planner, got {kind_of(planner)}")
 
 
 def value_of(value: Callable[[Tensor], Tensor], state: Tensor, name: str = "value") -> Tensor:
@@ -204,21 +204,19 @@ def value_of(value: Callable[[Tensor], Tensor], state: Tensor, name: str = "valu
     values = value(state)
     if not isinstance(values, Tensor):
         raise ValueError(
-            f"{name}: a tensor [{len(state)}] of the values of {len(state)} states is expected, not {kind_of(values)}"
+            f"`{name}` must be a tensor [{len(state)}] of the values of {len(state)} states, got {kind_of(values)}"
         )
     if values.numel() != len(state) or values.isnan().any():
-        raise ValueError(
-            f"{name}: one number for each of {len(state)} states is expected, none NaN; got {values.numel()}"
-        )
+        raise ValueError(f"`{name}` must be a number, not NaN, for each of {len(state)} states, got {values.numel()}")
     return values.view(-1)
 
 
 def check_objective(objective: str, discount: float) -> None:
     """Raise ValueError for an unknown `objective`, or a `discount` that is out of range or has no effect."""
     if objective not in ("terminal", "return"):
-        raise ValueError(f'objective: "terminal" or "return" is expected, not {objective!r}')
+        raise ValueError(f'`objective` must be "terminal" or "return", got {objective!r}')
     if not is_number(discount) or not 0 < discount <= 1:
-        raise ValueError(f"discount: a number above 0 and at most 1 is expected, not {discount!r}")
+        raise ValueError(f"`discount` must be a number above 0 and at most 1, got {discount!r}")
     if objective == "terminal" and discount != 1:
         raise ValueError('discount: it has no effect with objective="terminal"; use objective="return"')
 

@@ -109,7 +109,7 @@ def best_sampling(
     temperatures, uniform_shares = as_tried(temperatures, uniform_shares)
     check_in_world(prior, world, state)
     if len(state) == 0:
-        raise ValueError("state: at least one start is expected; from none, no setting is better than another")
+        raise ValueError("`state` must have at least one start; from none, no setting is better than another")
     generator = generator_on(generator, state.device)
 
     def planner(prior: Steppable, number: int, temperature: float = 1.0, share: float = 0.0) -> SamplingPlanner:
@@ -213,7 +213,7 @@ def search_weights(log_prob: Tensor, num_plans: int) -> Tensor:
     check_sizes(num_plans=num_plans)
     log_prob = torch.as_tensor(log_prob)
     if not bool((log_prob <= 0).all()):
-        raise ValueError("log_prob: logarithms of probabilities, at most 0, are expected")
+        raise ValueError("`log_prob` must be logarithms of probabilities, at most 0")
     log_prob = log_prob.double()
     others = torch.special.xlog1py(torch.tensor(num_plans - 1.0), -log_prob.exp())
     # Where a plan is impossible, the limit.
@@ -233,7 +233,7 @@ def as_tried(temperatures: Sequence[float], uniform_shares: Sequence[float]) -> 
     temperatures, uniform_shares = as_list("temperatures", temperatures), as_list("uniform_shares", uniform_shares)
     for name, values in (("temperatures", temperatures), ("uniform_shares", uniform_shares)):
         if not values:
-            raise ValueError(f"{name}: at least one is expected, not an empty list")
+            raise ValueError(f"`{name}` must have at least one, got an empty list")
     for temperature in temperatures:
         check_temperature(temperature)
     for share in uniform_shares:

@@ -183,7 +183,7 @@ class Column(dict[str, int]):
         if self.names is not None and label in self.names:
             return
         if not label:
-            raise ValueError(f"{self.what}: an empty cell; a number or a name is expected")
+            raise ValueError(f"`{self.what}` must be a number or a name, got an empty cell")
         if self.what not in NAMED and isinstance(number_in(label, self.what), float):
             hint = "features go into columns context_1, context_2, ..." if self.what == "context" else "or a name"
             raise ValueError(f"{self.what} {label!r} is not a whole number ({hint})")
@@ -324,21 +324,21 @@ def check_distinct(what: str, names: Sequence[str] | None) -> None:
     """Raise ValueError where a name occurs twice, so that a text would stand for two numbers."""
     if names is not None and len(set(names)) < len(names):
         twice = next(name for name in names if list(names).count(name) > 1)
-        raise ValueError(f"{what}: {twice!r} is there twice; different names are expected")
+        raise ValueError(f"`{what}` must be different names, got {twice!r} twice")
 
 
 def check_names(num_actions: int | None, action_names: Sequence[str] | None) -> Names | None:
     """The names as a tuple; ValueError for names, or a number of actions, that are impossible."""
     if num_actions is not None and (type(num_actions) is not int or num_actions < 1):
-        raise ValueError(f"num_actions: an integer of at least 1 is expected, not {num_actions!r}")
+        raise ValueError(f"`num_actions` must be an integer of at least 1, got {num_actions!r}")
     if action_names is None:
         return None
     names = tuple(action_names)
     if isinstance(action_names, str) or not names or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"action_names: a list of names is expected, not {action_names!r}")
+        raise ValueError(f"`action_names` must be a list of names, got {action_names!r}")
     check_distinct("action_names", names)
     if num_actions not in (None, len(names)):
-        raise ValueError(f"action_names: {num_actions} names are expected, as many as num_actions, not {len(names)}")
+        raise ValueError(f"`action_names` must be {num_actions} names, as many as num_actions, got {len(names)}")
     return names
 
 

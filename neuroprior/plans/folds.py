@@ -92,9 +92,9 @@ def fair_split(
 def check_alike(training: Sequences, validation: Sequences) -> None:
     """Raise ValueError unless the actions and contexts of both are the same ones, numbered alike."""
     if type(training) is not type(validation):
-        raise ValueError(f"validation: {type(training).__name__} are expected, not {type(validation).__name__}")
+        raise ValueError(f"`validation` must be {type(training).__name__}, got {type(validation).__name__}")
     if isinstance(training, Plans) and isinstance(validation, Plans) and validation.num_actions != training.num_actions:
-        raise ValueError(f"validation: {training.num_actions} actions are expected, not {validation.num_actions}")
+        raise ValueError(f"`validation` must have {training.num_actions} actions, got {validation.num_actions}")
     for what in ("action_names", "context_names"):
         names = getattr(training, what, None), getattr(validation, what, None)
         check_same_names(f"validation: {what}", *names, "these plans", "those that are learned from")
@@ -128,14 +128,14 @@ def folds(plans: Sequences, number: int, seed: int = 0) -> list[tuple[Tensor, Te
         [(4, 2), (4, 2), (4, 2)]
     """
     if not isinstance(plans, Sequences):
-        raise ValueError(f"plans: Plans are expected, not {type(plans).__name__}")
+        raise ValueError(f"`plans` must be Plans, got {type(plans).__name__}")
     grouped = plans.group is not None and len(plans.group.unique()) >= FEWEST_UNITS
     unit = plans.group.unique(return_inverse=True)[1].cpu() if grouped and plans.group is not None else None
     unit = torch.arange(len(plans)) if unit is None else unit
     count = int(unit.max()) + 1 if len(unit) else 0
     if not isinstance(number, int) or isinstance(number, bool) or not 2 <= number <= count:
         kind = "groups" if grouped else "plans"
-        raise ValueError(f"folds: between 2 and the number of {kind}, {count}, are expected, not {number!r}")
+        raise ValueError(f"`folds` must be between 2 and the number of {kind}, {count}, got {number!r}")
     check_seed(seed)
     drawn = torch.randperm(count, generator=torch.Generator().manual_seed(seed)) % number
     return [((drawn[unit] != fold).nonzero()[:, 0], (drawn[unit] == fold).nonzero()[:, 0]) for fold in range(number)]
@@ -158,7 +158,7 @@ def in_parts(plans: Plans, number: int = BLOCKS) -> Plans:
     check_sizes(number=number)
     length = int(plans.mask().sum())
     if len(plans) != 1 or length < number:
-        raise ValueError(f"plans: a single one of at least {number} actions is expected, not {len(plans)} of {length}")
+        raise ValueError(f"`plans` must be a single one of at least {number} actions, got {len(plans)} of {length}")
     return pieces(plans, -(-length // number))
 
 

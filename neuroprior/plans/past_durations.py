@@ -43,8 +43,8 @@ class PastDurations:
         check_sizes(number=self.number)
         if not -1e3 < self.center < 1e3 or not 0 < self.spread < 1e3:
             raise ValueError(
-                "center, spread: between -1000 and 1000 and above 0 to 1000 are expected, those of logarithms of times,"
-                f" not {self.center} and {self.spread}"
+                "`center` must be between -1000 and 1000, and `spread` above 0 to 1000, those of logarithms of times,"
+                f" got {self.center} and {self.spread}"
             )
 
     @classmethod
@@ -61,7 +61,7 @@ class PastDurations:
         times = durations_of(plans)[plans.mask(end=False)]
         logs = times[times > 0].double().log().sort()[0]
         if not len(logs):
-            raise ValueError("durations: none above 0 is known; at least one is expected")
+            raise ValueError("`durations` must have at least one above 0 that is known")
         # torch.quantile takes no more than 16 million numbers.
         low, middle, high = (float(logs[round(share * (len(logs) - 1))]) for share in (0.25, 0.5, 0.75))
         return cls(number, middle, (high - low) / QUARTILES or 1.0)

@@ -87,7 +87,7 @@ class Plans(Sequences):
             raise ValueError(f"num_actions: at most {MOST_ACTIONS}, not {self.num_actions}; number the actions from 0")
         actions = _tensor("actions", self.actions)
         if actions.dim() != 2:
-            raise ValueError(f"actions: shape [N, L] is expected, not {list(actions.shape)}")
+            raise ValueError(f"`actions` must have shape [N, L], got {list(actions.shape)}")
         object.__setattr__(self, "actions", actions)
         if self.end is not None:
             self._check_end(actions)
@@ -104,14 +104,14 @@ class Plans(Sequences):
         _check_texts("notes", self.notes)
         if self.action_names is not None and len(self.action_names) != self.num_actions:
             raise ValueError(
-                f"action_names: {self.num_actions} names are expected, one an action, not {len(self.action_names)}"
+                f"`action_names` must be {self.num_actions} names, one an action, got {len(self.action_names)}"
             )
         for what in ("group", "condition"):
             if getattr(self, what) is not None:
                 values = _tensor(what, getattr(self, what))
                 object.__setattr__(self, what, values)
                 if not is_integer(values):
-                    raise ValueError(f"{what}: integers are expected, not {str(values.dtype).removeprefix('torch.')}")
+                    raise ValueError(f"`{what}` must be integers, got {str(values.dtype).removeprefix('torch.')}")
                 _check_shape(what, values, (num,))
         if self.durations is not None:
             durations = _tensor("durations", self.durations)
@@ -122,7 +122,7 @@ class Plans(Sequences):
             if wrong.any():
                 where = wrong.nonzero()[0].tolist()
                 raise ValueError(
-                    f"durations{where}: {float(durations[tuple(where)])}; finite times from 0 are expected"
+                    f"`durations{where}` must be finite times from 0, got {float(durations[tuple(where)])}"
                 )
             object.__setattr__(self, "durations", durations.float().masked_fill(~self.mask(), 0))
         if self.context is not None:
@@ -135,7 +135,7 @@ class Plans(Sequences):
                 check_distinct(f"{what}_names", getattr(self, f"{what}_names"))
         if _check_texts("plan_names", self.plan_names):
             if len(self.plan_names or ()) != num:
-                raise ValueError(f"plan_names: {num} are expected, one a plan, not {len(self.plan_names or ())}")
+                raise ValueError(f"`plan_names` must be {num}, one a plan, got {len(self.plan_names or ())}")
             object.__setattr__(self, "plan_names", tuple(self.plan_names or ()))
         _check_names("group", self.group, self.group_names)
         _check_names("condition", self.condition, self.condition_names)
@@ -152,7 +152,7 @@ class Plans(Sequences):
     def _check_end(self, actions: Tensor) -> None:
         """Check that `end` only closes plans; where lengths are not given, take them from it."""
         if not isinstance(self.end, int) or isinstance(self.end, bool) or not 0 <= self.end < self.num_actions:
-            raise ValueError(f"end: one of the {self.num_actions} actions is expected, not {self.end!r}")
+            raise ValueError(f"`end` must be one of the {self.num_actions} actions, got {self.end!r}")
         position = torch.arange(1, actions.shape[1] + 1, device=actions.device)
         first = torch.where(actions == self.end, position, actions.shape[1]).amin(1) if actions.shape[1] else None
         if self.lengths is None:
@@ -320,7 +320,7 @@ class Plans(Sequences):
             ValueError: the plans have no end symbol, or it is not action A - 1.
         """
         if self.end is None or self.end != self.num_actions - 1:
-            raise ValueError(f"end: the last action, {self.num_actions - 1}, is expected, not {self.end!r}")
+            raise ValueError(f"`end` must be the last action, {self.num_actions - 1}, got {self.end!r}")
         taken = self.mask(end=False)
         lengths = taken.sum(1)
         opened = replace(
@@ -341,7 +341,7 @@ class Plans(Sequences):
 def check_are_plans(plans: object) -> None:
     """Raise ValueError for what is not `Plans`."""
     if not isinstance(plans, Plans):
-        raise ValueError(f"plans: Plans are expected, as in Plans(actions, num_actions), not {type(plans).__name__}")
+        raise ValueError(f"`plans` must be Plans, as in Plans(actions, num_actions), got {type(plans).__name__}")
 
 
 def all_plans(num_actions: int, length: int) -> Tensor:
@@ -386,21 +386,21 @@ def check_context(context: Tensor, num_plans: int, length: int) -> None:
     shape = tuple(context.shape)
     if has_patterns(context):
         if shape[:2] != (num_plans, length):
-            raise ValueError(f"context: patterns [{num_plans}, {length}, F] are expected, not {list(shape)}")
+            raise ValueError(f"`context` must be patterns [{num_plans}, {length}, F], got {list(shape)}")
         check_patterns(context)
         return
     if is_integer(context):
         if shape not in ((num_plans,), (num_plans, length)):
             raise ValueError(
-                f"context: indices of shape [{num_plans}] or [{num_plans}, {length}], or patterns"
-                f" [{num_plans}, {length}, F], are expected, not {list(shape)}"
+                f"`context` must be indices of shape [{num_plans}] or [{num_plans}, {length}], or patterns"
+                f" [{num_plans}, {length}, F], got {list(shape)}"
             )
         return
     if not context.is_floating_point():
-        raise ValueError(f"context: indices or floating point features are expected, not {context.dtype}")
+        raise ValueError(f"`context` must be indices or floating point features, got {context.dtype}")
     if len(shape) not in (2, 3) or shape[0] != num_plans or (len(shape) == 3 and shape[1] != length):
         raise ValueError(
-            f"context: features of shape [{num_plans}, C] or [{num_plans}, {length}, C] are expected, not {list(shape)}"
+            f"`context` must be features of shape [{num_plans}, C] or [{num_plans}, {length}, C], got {list(shape)}"
         )
     if not context.isfinite().all():
         where = (~context.isfinite()).nonzero()[0].tolist()
@@ -441,14 +441,14 @@ def _tensor(name: str, values: Any) -> Tensor:
         return torch.as_tensor(values)
     except (RuntimeError, TypeError, ValueError):
         raise ValueError(
-            f"{name}: numbers in rows of one length are expected (names go into {name.removesuffix('s')}_names, and how"
+            f"`{name}` must be numbers in rows of one length (names go into {name.removesuffix('s')}_names, and how"
             " long each plan is into lengths)"
         ) from None
 
 
 def _check_shape(name: str, values: Tensor, shape: tuple[int, ...]) -> None:
     if tuple(values.shape) != shape:
-        raise ValueError(f"{name}: shape {list(shape)} is expected, not {list(values.shape)}")
+        raise ValueError(f"`{name}` must have shape {list(shape)}, got {list(values.shape)}")
 
 
 def _check_texts(what: str, names: Sequence[str] | None) -> bool:
@@ -456,7 +456,7 @@ def _check_texts(what: str, names: Sequence[str] | None) -> bool:
     if names is not None and (
         not isinstance(names, Sequence) or isinstance(names, str) or not all(isinstance(name, str) for name in names)
     ):
-        raise ValueError(f"{what}: a list of texts is expected, not {names!r}")
+        raise ValueError(f"`{what}` must be a list of texts, got {names!r}")
     for name in filter(HALF_PAIR.search, names or () if what != "notes" else ()):
         raise ValueError(f"{what}: {name!r} has a broken character, half of a surrogate pair, which no file can hold")
     return names is not None
@@ -466,5 +466,5 @@ def _check_names(what: str, numbers: Tensor | None, names: Sequence[str] | None)
     if names is None:
         return
     if numbers is None or not is_integer(numbers):
-        raise ValueError(f"{what}_names: integers in {what} are expected with them, which they name")
+        raise ValueError(f"`{what}_names` must come with the integers in {what} that they name")
     check_range(what, numbers, len(names), f"{what} names")

@@ -19,7 +19,7 @@ def check_index(index: object) -> None:
     if isinstance(index, Integral) or getattr(index, "ndim", None) == 0:
         number = int(index)  # type: ignore[call-overload]
         raise IndexError(
-            f"plans[{number}]: a slice or a tensor is expected; plans[{number} : {number + 1 or ''}] is one plan"
+            f"`plans` must be indexed by a slice or a tensor; plans[{number} : {number + 1 or ''}] is one plan"
         )
 
 
@@ -95,7 +95,7 @@ class Sequences(ABC):
             check_count("stop", stop, 0)
         stop = self.max_length if stop is None else min(stop, self.max_length)
         if stop < min(first, self.max_length):
-            raise ValueError(f"stop: at least {first}, the first action, is expected, not {stop}")
+            raise ValueError(f"`stop` must be at least {first}, the first action, got {stop}")
         parts = {name: getattr(self, name, None) for name in ("actions", "durations", "context")}
         cut = {name: values[:, first:stop] for name, values in parts.items() if values is not None}
         if self.lengths is not None:
@@ -175,7 +175,7 @@ def check_validation(share: object) -> None:
     """Raise ValueError for what is no share of plans that can be held out."""
     if not is_number(share) or not 0 < share < 1:
         said = share if isinstance(share, Real | str | None) else type(share).__name__
-        raise ValueError(f"validation: a share between 0 and 1 is expected, not {said}")
+        raise ValueError(f"`validation` must be a share between 0 and 1, got {said}")
 
 
 def plans_digest(plans: Sequences) -> str:

@@ -19,7 +19,7 @@ def as_prior(given: Prior | Mapping[str, Any]) -> Prior:
     if isinstance(given, Prior):
         return given
     if not isinstance(given, Mapping):
-        raise ValueError(f"a prior is expected, not {given!r}")
+        raise ValueError(f"`prior` must be a prior or its description, got {given!r}")
     kind = SavedModule.known.find(given["prior"])
     if kind is None or not issubclass(kind, Prior):
         raise ValueError(f"{given['prior']}: not a prior over numbered actions")

@@ -58,24 +58,24 @@ def fit(
     """
     if isinstance(prior, Prior):
         raise ValueError(
-            f"prior: a class, a function or a name is expected, not a {type(prior).__name__} that is made already; use"
+            f"`prior` must be a class, a function or a name, got one {type(prior).__name__} that is made already; use"
             " its own fit(plans)"
         )
     given: object = plans
     if isinstance(given, Sequences) and not isinstance(given, Plans):
-        raise ValueError(f"plans: Plans of numbered actions are expected, not {type(given).__name__}")
+        raise ValueError(f"`plans` must be Plans of numbered actions, got {type(given).__name__}")
     if not isinstance(plans, Plans):
         actions = as_actions(plans)
         plans = Plans(actions, int(actions.max()) + 1 if actions.numel() else 1)
     if not plans.mask().any():
-        raise ValueError(f"plans: at least one action to learn from is expected, and the {len(plans)} plans have none")
+        raise ValueError(f"`plans` must have at least one action to learn from; these {len(plans)} have none")
     if isinstance(prior, str):
         kind = PRIORS.find(prior)
         if kind is None:
-            raise ValueError(f"prior: one of {', '.join(PRIORS)} is expected, not {prior!r}")
+            raise ValueError(f"`prior` must be one of {', '.join(PRIORS)}, got {prior!r}")
         prior = kind
     if not callable(prior):
-        raise ValueError(f"prior: a class, a function or a name is expected, not {prior!r}")
+        raise ValueError(f"`prior` must be a class, a function or a name, got {prior!r}")
     if effort is not None:
         if prior is not CombinedPrior:
             raise ValueError("effort: for the combined prior alone; leave it out, or leave prior out")

@@ -92,7 +92,7 @@ def infer(
     observed = _observed(plans, context, named)
     check_share("switch", switch)
     if not is_number(power) or not 0 <= power < inf:
-        raise ValueError(f"power: a finite number of at least 0 is expected, not {power!r}")
+        raise ValueError(f"`power` must be a finite number of at least 0, got {power!r}")
     batch, length = len(observed), observed.max_length
     prior_log = _log_weights(weights, batch, len(named))
     scores = [
@@ -172,19 +172,19 @@ def forecast(
     world.check_state(state)
     if isinstance(posterior, Posterior) and list(posterior.names) != list(named):
         names = ", ".join(named), ", ".join(posterior.names)
-        raise ValueError(f"posterior: that of the priors {names[0]} is expected, not of {names[1]}")
+        raise ValueError(f"`posterior` must be that of the priors {names[0]}, got that of {names[1]}")
     probs = posterior.log_probs[:, -1].exp() if isinstance(posterior, Posterior) else torch.as_tensor(posterior)
     probs = probs.double().cpu()
     if probs.shape != (len(state), len(named)):
         raise ValueError(
-            f"posterior: shape [B, K] = {[len(state), len(named)]} is expected (a row for each state, a column for"
-            f" each prior), not {list(probs.shape)}"
+            f"`posterior` must have shape [B, K] = {[len(state), len(named)]} (a row for each state, a column for"
+            f" each prior), got {list(probs.shape)}"
         )
     if not bool(((probs >= 0).all(-1) & ((probs.sum(-1) - 1).abs() < 1e-3)).all()):
-        raise ValueError("posterior: probabilities that sum to 1 in each row are expected; of log_probs take exp()")
+        raise ValueError("`posterior` must be probabilities that sum to 1 in each row; of log_probs take exp()")
     targets = torch.as_tensor(targets, device=state.device)
     if targets.dim() != state.dim() or targets.shape[1:] != state.shape[1:]:
-        raise ValueError(f"targets: states of shape {['S', *state.shape[1:]]} are expected, not {list(targets.shape)}")
+        raise ValueError(f"`targets` must be states of shape {['S', *state.shape[1:]]}, got {list(targets.shape)}")
     world.check_state(targets)
     generator = generator_on(generator, state.device)
     shares = []
@@ -201,11 +201,11 @@ def forecast(
 def _named(priors: Mapping[str, Prior] | Sequence[Prior]) -> dict[str, Prior]:
     """The priors by name; those of a list have their numbers."""
     if not isinstance(priors, Mapping | Sequence) or not priors:
-        raise ValueError("priors: at least one prior for each intention is expected, by name or in a list")
+        raise ValueError("`priors` must have at least one prior for each intention, by name or in a list")
     named = dict(priors) if isinstance(priors, Mapping) else {str(k): prior for k, prior in enumerate(priors)}
     for name, prior in named.items():
         if not isinstance(prior, Prior):
-            raise ValueError(f"priors[{name!r}]: a fitted prior is expected, not {type(prior).__name__}")
+            raise ValueError(f"`priors[{name!r}]` must be a fitted prior, got {type(prior).__name__}")
     known = {name: prior.num_actions - (prior.end is not None) for name, prior in named.items()}
     if len(set(known.values())) > 1:
         raise ValueError(f"priors: all must know the same number of actions, not {known}")
@@ -231,7 +231,7 @@ def _log_weights(weights: Tensor | Sequence[float] | None, batch: int, number: i
     given = torch.ones(number) if weights is None else torch.as_tensor(weights)
     given = given.double().cpu()
     if given.shape not in ((number,), (batch, number)):
-        raise ValueError(f"weights: shape [{number}] or [{batch}, {number}] is expected, not {list(given.shape)}")
+        raise ValueError(f"`weights` must have shape [{number}] or [{batch}, {number}], got {list(given.shape)}")
     if not bool(given.isfinite().all()) or bool((given < 0).any()) or bool((given.sum(-1) <= 0).any()):
-        raise ValueError("weights: finite numbers from 0 are expected, with one above 0 in each row")
+        raise ValueError("`weights` must be finite numbers from 0, with one above 0 in each row")
     return (given / given.sum(-1, keepdim=True)).log().expand(batch, number)

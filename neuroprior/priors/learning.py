@@ -60,7 +60,7 @@ def known_plans(prior: Prior, plans: Plans | Tensor) -> Plans:
     plans = plans if prior.takes_context else plans.without_context()
     prior.check_plans(plans)
     if not bool(plans.mask().any()):
-        raise ValueError("plans: at least one with an action is expected")
+        raise ValueError("`plans` must have at least one plan with an action")
     return plans
 
 
@@ -76,5 +76,5 @@ def counted_plans(prior: Prior, plans: Plans | Tensor) -> Plans:
     if not prior.has_learned:
         return training_plans(prior, plans)
     if plans.end != prior.end:
-        raise ValueError(f"plans: end={prior.end} is expected, as in those it learned from, not {plans.end}")
+        raise ValueError(f"`plans` must have end={prior.end}, as those it learned from, got {plans.end}")
     return plans

@@ -43,9 +43,7 @@ def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
         return plans if prior.past_durations is None else prior.past_durations.added_to(plans)
     known = prior.num_actions - (prior.end is not None)
     if plans.num_actions > known:
-        raise ValueError(
-            f"{name}: it knows {known} actions, and the plans have {plans.num_actions}; at most as many are expected"
-        )
+        raise ValueError(f"`{name}` must know at least the {plans.num_actions} actions of the plans, got {known}")
     plans = renumbered(plans, known, learned_names(prior), prior.context_names, name)
     if not prior.takes_context:
         plans = plans.without_context()
@@ -72,7 +70,7 @@ def decode(plans: Plans | Tensor, prior: Prior | None = None) -> list[list[str]]
         [['eat', 'walk'], ['rest']]
     """
     if isinstance(plans, Plans) != (prior is None):
-        raise ValueError("decode: Plans, or samples and the prior that they are from, are expected")
+        raise ValueError("`decode` must be Plans, or samples and the prior that they are from")
     if not isinstance(plans, Plans):
         assert prior is not None
         plans = Plans(as_actions(plans), prior.num_actions, action_names=prior.action_names, end=prior.end)

@@ -132,7 +132,7 @@ class Prior(SavedModule):
         self.context_per, self.has_learned = context_per, True
         end = learned["end"]
         if end is not None and (not isinstance(end, int) or not 0 <= end < self.num_actions):
-            raise ValueError(f"end: one of the {self.num_actions} actions is expected, not {end!r}")
+            raise ValueError(f"`end` must be one of the {self.num_actions} actions, got {end!r}")
         self.end = end
         self.action_names = _names("action_names", learned, self.num_actions)
         self.context_names = _names("context_names", learned, self.num_contexts or 0)
@@ -342,12 +342,12 @@ class Prior(SavedModule):
         if self.num_contexts is not None:
             if not is_integer(context):
                 kind = str(context.dtype).removeprefix("torch.")
-                raise ValueError(f"context: indices below {self.num_contexts} are expected, not features ({kind})")
+                raise ValueError(f"`context` must be indices below {self.num_contexts}, got features ({kind})")
             check_range("context", context, self.num_contexts, "contexts")
         elif is_integer(context) or context.shape[-1] != self.context_size:
             raise ValueError(
-                f"context: floating point features of size {self.context_size} are expected,"
-                f" not {str(context.dtype).removeprefix('torch.')} of shape {list(context.shape)}"
+                f"`context` must be floating point features of size {self.context_size},"
+                f" got {str(context.dtype).removeprefix('torch.')} of shape {list(context.shape)}"
             )
 
     def check_settings(self, settings: Mapping[str, Any]) -> None:
@@ -363,13 +363,13 @@ class Prior(SavedModule):
 def check_actions(prior: Prior, plans: Plans) -> None:
     """Raise ValueError unless the plans have as many actions as the prior."""
     if plans.num_actions != prior.num_actions:
-        raise ValueError(f"plans: {prior.num_actions} actions are expected, as this prior has, not {plans.num_actions}")
+        raise ValueError(f"`plans` must have {prior.num_actions} actions, as this prior, got {plans.num_actions}")
 
 
 def check_is_prior(prior: object) -> None:
     """Raise ValueError unless it is a `Prior`."""
     if not isinstance(prior, Prior):
-        raise ValueError(f"prior: a Prior is expected, not {kind_of(prior)}")
+        raise ValueError(f"`prior` must be a Prior, got {kind_of(prior)}")
 
 
 def _check_patterns_of(context: Tensor, num_patterns: int, num_plans: int, length: int, plans: bool) -> None:
@@ -379,7 +379,7 @@ def _check_patterns_of(context: Tensor, num_patterns: int, num_plans: int, lengt
     fitting = [num_plans, steps, num_patterns] if plans or context.dim() == 3 else [num_plans, num_patterns]
     if not is_integer(context) or shape != fitting:
         raise ValueError(
-            f"context: {num_patterns} patterns (integers) of each state, {fitting}, are expected, not"
+            f"`context` must be {num_patterns} patterns (integers) of each state, {fitting}, got"
             f" {str(context.dtype).removeprefix('torch.')} of shape {shape}"
         )
     check_patterns(context)
@@ -390,7 +390,7 @@ def as_actions(plans: Any) -> Tensor:
     try:
         return torch.as_tensor(plans)
     except (RuntimeError, TypeError, ValueError):
-        raise ValueError(f"plans: Plans or a tensor is expected, not {type(plans).__name__}") from None
+        raise ValueError(f"`plans` must be Plans or a tensor, got {type(plans).__name__}") from None
 
 
 def _names(what: str, learned: dict[str, Any], most: int) -> tuple[str, ...] | None:
@@ -399,7 +399,7 @@ def _names(what: str, learned: dict[str, Any], most: int) -> tuple[str, ...] | N
     if names is None:
         return None
     if not isinstance(names, list | tuple) or len(names) > most or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"{what}: at most {most} texts are expected")
+        raise ValueError(f"`{what}` must be at most {most} texts")
     return tuple(names)
 
 

@@ -44,7 +44,7 @@ def score(prior: Prior, plans: Plans, by: Literal["plan", "group", "condition", 
     """
     if not isinstance(prior, Prior):
         raise ValueError(
-            "prior: a fitted prior of numbered actions is expected (neuroprior.load gives that of a folder), not"
+            "`prior` must be a fitted prior of numbered actions (neuroprior.load gives that of a folder), got"
             f" {type(prior).__name__}"
         )
     with torch.no_grad():
@@ -57,7 +57,7 @@ def scores_by(bits: Tensor, plans: Plans, by: str) -> Any:
     import pandas as pd
 
     if by not in ("plan", "group", "condition", "action"):
-        raise ValueError(f"by: one of plan, group, condition, action is expected, not {by!r}")
+        raise ValueError(f"`by` must be one of plan, group, condition, action, got {by!r}")
     if by in ("group", "condition") and getattr(plans, by) is None:
         raise ValueError(f"by: the plans have no {by}")
     mask = plans.mask()

@@ -51,7 +51,7 @@ def save(prior: SavedModule, folder: str | os.PathLike[str]) -> Path:
         ['config.json', 'model.safetensors']
     """
     if not isinstance(prior, SavedModule):
-        raise ValueError(f"prior: a Prior is expected, not {type(prior).__name__}")
+        raise ValueError(f"`prior` must be a Prior, got {type(prior).__name__}")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     data = written_state(prior)
@@ -99,7 +99,7 @@ def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu", *, 
         2
     """
     if not isinstance(folder, str | os.PathLike):
-        raise ValueError(f"folder: the name of a folder is expected, not {type(folder).__name__}")
+        raise ValueError(f"`folder` must be the name of a folder, got {type(folder).__name__}")
     folder = Path(folder)
     config = _read_config(folder / "config.json")
     if not isinstance(kind, type):

@@ -77,7 +77,7 @@ def sample(
     _check(num_plans, length, temperature, batch_size)
     if not hasattr(prior, "num_actions"):
         raise ValueError(
-            f"prior: one over numbered actions is expected, not {type(prior).__name__}; priors over vectors have a"
+            f"`prior` must be one over numbered actions, got {type(prior).__name__}; priors over vectors have a"
             " method sample of their own"
         )
     # Memory of the plans, and of the uniform numbers with which some are drawn together.
@@ -87,7 +87,7 @@ def sample(
     device = stepper.device
     context = None if context is None else torch.as_tensor(context, device=device)
     if method not in ("auto", "ancestral", "tree"):
-        raise ValueError(f'method: "auto", "ancestral" or "tree" is expected, not {method!r}')
+        raise ValueError(f'`method` must be "auto", "ancestral" or "tree", got {method!r}')
     if context is not None and context.shape[0] != num_plans:
         raise ValueError(f"context: its first dimension must be num_plans = {num_plans}, not {context.shape[0]}")
     past = _checked_past(past, num_plans, prior.num_actions).to(device)
@@ -273,7 +273,7 @@ def _checked_past(past: Tensor | None, num_plans: int, num_actions: int) -> Tens
         return torch.zeros(0, dtype=torch.long)
     past = torch.as_tensor(past)
     if past.dim() not in (1, 2) or (past.dim() == 2 and len(past) != num_plans):
-        raise ValueError(f"past: actions [T] or [{num_plans}, T] are expected, not {list(past.shape)}")
+        raise ValueError(f"`past` must be actions [T] or [{num_plans}, T], got {list(past.shape)}")
     if past.numel():
         check_range("past", past, num_actions, "actions")
     return past.long()

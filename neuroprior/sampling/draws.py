@@ -19,7 +19,7 @@ LEAST_TEMPERATURE = 1e-30
 def check_temperature(temperature: Any) -> None:
     """Raise ValueError unless logits can be divided by it."""
     if isinstance(temperature, str | bool | None) or not 0 < temperature < float("inf"):
-        raise ValueError(f"temperature: a positive finite number is expected, not {temperature!r}")
+        raise ValueError(f"`temperature` must be a positive finite number, got {temperature!r}")
     if temperature < LEAST_TEMPERATURE:
         raise ValueError(f"temperature: {temperature!r} is too small to divide by; {LEAST_TEMPERATURE} is enough")
 

@@ -158,7 +158,7 @@ class Stepper:
         context = None if self.context_per is None else world.observe(state)
         if context is not None and not is_per_plan(context) and getattr(self._prior, "num_patterns", None) is None:
             raise ValueError(
-                f"observe: indices [N] or features [N, C] are expected, not {context.dtype} {list(context.shape)}"
+                f"`observe` must be indices [N] or features [N, C], got {context.dtype} {list(context.shape)}"
             )
         self.check_context(context, len(state))
         return self.start(len(state), context)
@@ -201,9 +201,7 @@ def check_in_world(prior: Steppable, world: World, state: Tensor) -> None:
 def check_actions(prior: Steppable, world: World) -> None:
     """Raise ValueError unless a prior has as many actions as a world, and no other names for them."""
     if prior.num_actions != world.num_actions:
-        raise ValueError(
-            f"prior: it has {prior.num_actions} actions, and the world {world.num_actions}; as many are expected"
-        )
+        raise ValueError(f"`prior` must have {world.num_actions} actions, as the world, got {prior.num_actions}")
     check_same_names(
         "action_names", getattr(prior, "action_names", None), world.action_names, "the world", "the prior",
         "number them alike, or learn from plans without names",

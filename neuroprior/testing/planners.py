@@ -42,9 +42,9 @@ def check_planner(make: Make, enough: int = 512, seed: int = 0) -> None:
         state = world.reset(20, torch.Generator().manual_seed(seed))
         for length, num_plans in ((1, 1), (3, 2), (4, enough)):
             planner = make(UniformPrior(2), length, num_plans)
-            require(isinstance(planner, Planner), f"make: a Planner is expected, not {type(planner).__name__}")
+            require(isinstance(planner, Planner), f"`make` must be a Planner, got {type(planner).__name__}")
             decision = planner.plan(world, state, torch.Generator().manual_seed(seed))
-            require(isinstance(decision, Decision), f"plan: a Decision is expected, not {type(decision).__name__}")
+            require(isinstance(decision, Decision), f"`plan` must be a Decision, got {type(decision).__name__}")
             _check_decision(planner, world, state, decision, length)
             _check_against_oracle(planner, world, state, decision, length, num_plans >= enough)
             _check_seed(planner, world, state, decision, seed)
@@ -75,10 +75,10 @@ def _check_decision(planner: Planner, world: TabularWorld, state: Tensor, decisi
         shapes == ((batch, length), (batch,), state.shape),
         f"plan from {batch} starts: plan, score and final_state of shapes {[list(shape) for shape in shapes]}",
     )
-    require(decision.score.is_floating_point(), f"score: floating point is expected, not {decision.score.dtype}")
-    require(is_integer(decision.plan), f"plan: integers are expected, not {decision.plan.dtype}")
+    require(decision.score.is_floating_point(), f"`score` must be floating point, got {decision.score.dtype}")
+    require(is_integer(decision.plan), f"`plan` must be integers, got {decision.plan.dtype}")
     last = torch.full((batch,), length) if decision.lengths is None else decision.lengths
-    require(bool(((last >= 1) & (last <= length)).all()), f"lengths: from 1 to {length} are expected, not {last}")
+    require(bool(((last >= 1) & (last <= length)).all()), f"`lengths` must be from 1 to {length}, got {last}")
     now, rewards, states = state, [], []
     for t in range(length):
         action = decision.plan[:, t].long()
@@ -125,7 +125,7 @@ def _check_steps(planner: Planner, world: TabularWorld, state: Tensor, seed: int
     given = planner.plan(world, state[:8], torch.Generator().manual_seed(seed)).model_steps
     require(
         given < 2 * most or not given,
-        f"model_steps: {given} are given of 8 starts, at most {most} of each alone; those of one are expected",
+        f"`model_steps` must be those of one start, at most {most}, got {given} of 8 starts",
     )
 
 

@@ -47,10 +47,10 @@ def check_world(world: Any, num_states: int = 50, length: int = 6, seed: int = 0
     """
     if check_by_kind(WORLD_CHECKS, world, length, num_states, seed):
         return
-    require(isinstance(world, World), f"a World is expected, not {type(world).__name__}")
+    require(isinstance(world, World), f"`world` must be a World, got {type(world).__name__}")
     number = getattr(world, "num_actions", None)
     some = isinstance(number, Integral) and int(number) > 0
-    require(some, f"num_actions: an integer above 0 is expected, not {number!r}")
+    require(some, f"`num_actions` must be an integer above 0, got {number!r}")
     generator = torch.Generator().manual_seed(seed)
     state = check_reset(world, num_states, seed)
     plans, wrong_plans = _plans(world, state, length, generator)

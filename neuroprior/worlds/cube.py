@@ -50,9 +50,9 @@ class PocketCube(World):
         absorbing: bool = False,
     ) -> None:
         if turns not in ("half", "quarter"):
-            raise ValueError(f'turns: "half" or "quarter" is expected, not {turns!r}')
+            raise ValueError(f'`turns` must be "half" or "quarter", got {turns!r}')
         if reward not in ("solved", "distance"):
-            raise ValueError(f'reward: "solved" or "distance" is expected, not {reward!r}')
+            raise ValueError(f'`reward` must be "solved" or "distance", got {reward!r}')
         check_count("scramble", scramble, 0)
         self.turns, self.scramble, self.reward_kind, self.absorbing = turns, scramble, reward, absorbing
         permutations, orientations = _all_permutations(), _all_orientations()
@@ -136,7 +136,7 @@ class PocketCube(World):
 
     def check_state(self, state: Tensor) -> None:
         if not isinstance(state, Tensor) or state.dim() != 1 or state.dtype != torch.int64:
-            raise ValueError("state: int64 of shape [B] is expected: numbers of states of the cube")
+            raise ValueError("`state` must be int64 of shape [B], numbers of states of the cube")
         check_range("state", state, NUM_STATES, "states of the cube")
 
 

@@ -51,11 +51,9 @@ class EpisodicWorld(TabularWorld):
         super().__init__(next_state, reward, None, action_names, probability=probability)
         for name, table in (("starts", starts), ("ended", ended), ("layouts", layouts), ("features", features)):
             if table is not None and len(table) != self.num_states:
-                raise ValueError(
-                    f"{name}: one entry for each of {self.num_states} states is expected, not {len(table)}"
-                )
+                raise ValueError(f"`{name}` must be one entry for each of {self.num_states} states, got {len(table)}")
         if not (starts >= 0).all() or not starts.sum() > 0:
-            raise ValueError("starts: probabilities are expected, not all of them 0")
+            raise ValueError("`starts` must be probabilities, got all of them 0")
         here = ended.nonzero()[:, 0]
         if not (self.next_state[here].flatten(1) == here[:, None]).all():
             raise ValueError("ended: every action must stay where an episode has ended")

@@ -142,12 +142,12 @@ def gridworld(
         (4, torch.Size([3, 400]))
     """
     if not is_number(reward_power) or not 0 < reward_power < float("inf"):
-        raise ValueError(f"reward_power: a positive finite number is expected, not {reward_power!r}")
+        raise ValueError(f"`reward_power` must be a positive finite number, got {reward_power!r}")
     check_sizes(height=height, width=width, num_worlds=num_worlds)
     check_seed(seed)
     check_memory(8 * height * width * num_worlds, height=height, width=width, num_worlds=num_worlds)
     if edges not in ("wall", "torus"):
-        raise ValueError(f'edges: "wall" or "torus" is expected, not {edges!r}')
+        raise ValueError(f'`edges` must be "wall" or "torus", got {edges!r}')
     uniform = torch.rand(num_worlds, height * width, generator=torch.Generator().manual_seed(seed))
     return GridWorld(height, width, edges, uniform.pow(reward_power))
 
@@ -165,7 +165,7 @@ def egocentric(world: GridWorld) -> GridWorld:
         ('left', 'right', 'forward')
     """
     if world.egocentric:
-        raise ValueError("world: its agents have headings already; a grid with four moves is expected")
+        raise ValueError("`world` must be a grid with four moves, got one whose agents have headings")
     return GridWorld(
         world.height, world.width, world.edges, world.reward, walls=world.walls, egocentric=True, view=world.view
     )
@@ -216,7 +216,7 @@ def goal_direction(world: GridWorld) -> Callable[[Tensor], Tensor]:
     """
     if world.edges == "torus":
         raise ValueError(
-            "world: a grid whose edges are walls is expected, not a torus, where there are several ways to count"
+            "`world` must be a grid whose edges are walls, got a torus, where there are several ways to count"
         )
     area = world.height * world.width
     reward = world.reward[:, ::4] if world.egocentric else world.reward
@@ -236,7 +236,7 @@ def goal_direction(world: GridWorld) -> Callable[[Tensor], Tensor]:
 def _check_view(view: int | None) -> None:
     """Raise ValueError unless `view` is a radius of at least 1, or None."""
     if view is not None and (isinstance(view, bool) or not isinstance(view, int) or view < 1):
-        raise ValueError(f"view: a radius of at least 1 square is expected, not {view!r}")
+        raise ValueError(f"`view` must be a radius of at least 1 square, got {view!r}")
 
 
 def _view_table(walls: Tensor, edges: Literal["wall", "torus"], radius: int, egocentric: bool) -> Tensor:
@@ -293,8 +293,8 @@ def _turns_and_moves(moves: Tensor) -> Tensor:
 def _check_walls(walls: Tensor, height: int, width: int) -> None:
     if walls.dtype != torch.bool or walls.dim() != 3 or walls.shape[1:] != (height, width) or len(walls) == 0:
         raise ValueError(
-            f"walls: bool of shape [M, {height}, {width}] is expected,"
-            f" not {str(walls.dtype).removeprefix('torch.')} of shape {list(walls.shape)}"
+            f"`walls` must be bool of shape [M, {height}, {width}],"
+            f" got {str(walls.dtype).removeprefix('torch.')} of shape {list(walls.shape)}"
         )
     full = walls.flatten(1).all(1).nonzero()
     if len(full):

@@ -46,7 +46,7 @@ def four_rooms(
     """
     check_sizes(height=height, width=width)
     if height < 5 or width < 5:
-        raise ValueError(f"height, width: at least 5 squares are expected, not {height} x {width}")
+        raise ValueError(f"`height, width` must be at least 5 squares, got {height} x {width}")
     _check(num_layouts, num_worlds, reward, reward_power)
     check_seed(seed)
     generator = torch.Generator().manual_seed(seed)
@@ -98,7 +98,7 @@ def maze(
     """
     check_sizes(height=height, width=width)
     if min(height, width) < 3 or height % 2 == 0 or width % 2 == 0:
-        raise ValueError(f"height, width: odd numbers of at least 3 are expected, not {height} x {width}")
+        raise ValueError(f"`height, width` must be odd numbers of at least 3, got {height} x {width}")
     check_share("loops", loops)
     _check(num_layouts, num_worlds, reward, reward_power)
     check_seed(seed)
@@ -163,8 +163,8 @@ def _rewards(walls: Tensor, num_worlds: int, kind: str, power: float, generator:
 def _check(num_layouts: int, num_worlds: int, reward: str, reward_power: float) -> None:
     check_sizes(num_layouts=num_layouts, num_worlds=num_worlds)
     if reward not in ("random", "goal"):
-        raise ValueError(f'reward: "random" or "goal" is expected, not {reward!r}')
+        raise ValueError(f'`reward` must be "random" or "goal", got {reward!r}')
     if not is_number(reward_power) or not 0 < reward_power < float("inf"):
-        raise ValueError(f"reward_power: a positive finite number is expected, not {reward_power!r}")
+        raise ValueError(f"`reward_power` must be a positive finite number, got {reward_power!r}")
     if reward == "goal" and reward_power != 1:
         raise ValueError('reward_power: it has no effect with reward="goal"; use reward="random"')

@@ -69,9 +69,7 @@ def _check_probability(probability: Tensor) -> None:
     wrong = ~((probability >= 0) & (probability < torch.inf))
     if wrong.any():
         where = wrong.nonzero()[0].tolist()
-        raise ValueError(
-            f"probability{where}: a number from 0 to 1 is expected, not {float(probability[tuple(where)]):g}"
-        )
+        raise ValueError(f"`probability{where}` must be a number from 0 to 1, got {float(probability[tuple(where)]):g}")
     total = probability.double().sum(-1)
     wrong = (total - 1).abs() > SUM_TOLERANCE
     if wrong.any():

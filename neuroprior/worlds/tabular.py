@@ -78,7 +78,7 @@ class TabularWorld(World):
         )
         self.all_legal = self.legal_table is None
         if action_names is not None and len(action_names) != self.num_actions:
-            raise ValueError(f"action_names: {self.num_actions} names are expected, not {len(action_names)}")
+            raise ValueError(f"`action_names` must have {self.num_actions} names, got {len(action_names)}")
         self.action_names = None if action_names is None else tuple(action_names)
 
     def _set_maps(self, reward: Tensor) -> None:
@@ -241,11 +241,9 @@ class TabularWorld(World):
     def check_state(self, state: Tensor) -> None:
         super().check_state(state)
         if state.dim() != 1:
-            raise ValueError(f"state: shape [B] is expected, not {list(state.shape)}")
+            raise ValueError(f"`state` must have shape [B], got {list(state.shape)}")
         if state.dtype != torch.int64:
-            raise ValueError(
-                f"state: int64 is expected, not {str(state.dtype).removeprefix('torch.')}; use state.long()"
-            )
+            raise ValueError(f"`state` must be int64, got {str(state.dtype).removeprefix('torch.')}; use state.long()")
         check_range("state", state, self.num_maps * self.num_states, "states (reward maps x cells)")
 
 
@@ -254,16 +252,16 @@ def _check_shapes(next_state: Tensor, probability: Tensor | None, legal: Tensor 
     if probability is None:
         if next_state.dim() != 2 or 0 in next_state.shape:
             raise ValueError(
-                f"next_state: shape [S, A] (or [S, A, K], with probability=) is expected, not {list(next_state.shape)}"
+                f"`next_state` must have shape [S, A] (or [S, A, K], with probability=), got {list(next_state.shape)}"
             )
         return
     if next_state.dim() != 3 or 0 in next_state.shape:
-        raise ValueError(f"next_state: with probability, shape [S, A, K] is expected, not {list(next_state.shape)}")
+        raise ValueError(f"`next_state` must be with probability: shape [S, A, K], got {list(next_state.shape)}")
     probability = torch.as_tensor(probability)
     if probability.shape != next_state.shape or not probability.is_floating_point():
         raise ValueError(
-            f"probability: floating point of shape {list(next_state.shape)}, as next_state, is expected,"
-            f" not {str(probability.dtype).removeprefix('torch.')} of shape {list(probability.shape)}"
+            f"`probability` must be floating point of shape {list(next_state.shape)}, as next_state,"
+            f" got {str(probability.dtype).removeprefix('torch.')} of shape {list(probability.shape)}"
         )
     if legal is not None:
         raise ValueError("legal_actions: with probability every action must be legal in every cell; leave it out")
@@ -274,7 +272,7 @@ def _reward_maps(reward: Tensor, table: torch.Size) -> Tensor:
     if is_integer(reward) or reward.dtype == torch.bool:
         reward = reward.float()
     if not reward.is_floating_point():
-        raise ValueError(f"reward: real numbers are expected, not {str(reward.dtype).removeprefix('torch.')}")
+        raise ValueError(f"`reward` must be real numbers, got {str(reward.dtype).removeprefix('torch.')}")
     if reward.isnan().any():
         raise ValueError(f"reward{reward.isnan().nonzero()[0].tolist()}: NaN is not a reward")
     shape = tuple(reward.shape)
@@ -294,14 +292,14 @@ def _reward_maps(reward: Tensor, table: torch.Size) -> Tensor:
         return reward.contiguous()
     names = [f"[{', '.join(kind)}]" for kind in kinds] + [f"[W, {', '.join(kind)}]" for kind in kinds]
     sizes = ", ".join(f"{letter} = {size}" for letter, size in zip(letters, table, strict=True))
-    raise ValueError(f"reward: {', '.join(names[:-1])} or {names[-1]} with {sizes} is expected, not {list(shape)}")
+    raise ValueError(f"`reward` must be {', '.join(names[:-1])} or {names[-1]} with {sizes}, got {list(shape)}")
 
 
 def _checked_legal(legal: Tensor, next_state: Tensor) -> Tensor:
     if legal.dtype != torch.bool or legal.shape != next_state.shape:
         raise ValueError(
-            f"legal_actions: bool of shape {list(next_state.shape)} is expected,"
-            f" not {str(legal.dtype).removeprefix('torch.')} of shape {list(legal.shape)}"
+            f"`legal_actions` must be bool of shape {list(next_state.shape)},"
+            f" got {str(legal.dtype).removeprefix('torch.')} of shape {list(legal.shape)}"
         )
     stuck = (~legal.any(1)).nonzero()
     if len(stuck):
@@ -312,4 +310,4 @@ def _checked_legal(legal: Tensor, next_state: Tensor) -> Tensor:
 def check_tabular(world: object) -> None:
     """Raise ValueError unless a world is a table, which exact solutions need."""
     if not isinstance(world, TabularWorld):
-        raise ValueError(f"world: a TabularWorld is expected, not {type(world).__name__}")
+        raise ValueError(f"`world` must be a TabularWorld, got {type(world).__name__}")

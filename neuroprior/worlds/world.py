@@ -155,7 +155,7 @@ class World(ABC):
     def check_state(self, state: Tensor) -> None:
         """Raise ValueError where `state` cannot be a batch of this world's states. Default: it must have a batch."""
         if not isinstance(state, Tensor) or state.dim() == 0:
-            raise ValueError("state: a tensor of shape [B, ...] is expected, not a single number or another type")
+            raise ValueError("`state` must be a tensor of shape [B, ...], got a single number or another type")
 
 
 def join_states(states: list[Tensor], start: Tensor, shape: tuple[int, ...]) -> Tensor:
@@ -168,7 +168,7 @@ def join_states(states: list[Tensor], start: Tensor, shape: tuple[int, ...]) -> 
 def check_is_world(world: object) -> None:
     """Raise ValueError unless it is a `World`."""
     if not isinstance(world, World):
-        raise ValueError(f"world: a World, whose actions are numbered, is expected, not {kind_of(world)}")
+        raise ValueError(f"`world` must be a World, whose actions are numbered, got {kind_of(world)}")
     if not hasattr(world, "num_actions"):
         raise ValueError(f"num_actions: {type(world).__name__} does not say how many actions it has")
 
@@ -177,7 +177,7 @@ def check_plans(plans: Tensor, batch_size: int, num_actions: int) -> None:
     """Raise ValueError unless `plans` is an integer tensor `[batch_size, P, L]` of actions below `num_actions`."""
     if plans.dim() != 3 or plans.shape[0] != batch_size:
         raise ValueError(
-            f"plans: shape [B, P, L] with B = {batch_size} starts is expected, not {list(plans.shape)}"
+            f"`plans` must have shape [B, P, L] with B = {batch_size} starts, got {list(plans.shape)}"
             " (for one plan per start, use plans[:, None])"
         )
     check_range("plans", plans, num_actions, "actions")

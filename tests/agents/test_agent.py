@@ -444,15 +444,15 @@ def test_damaged_checkpoints(tmp_path):
     ("given", "word"),
     [
         ({"replan_every": 0}, "replan_every"),
-        ({"plan_length": 5}, "plan_length: a multiple of replan_every = 2"),
-        ({"learn_every": 8}, "learn_every: a multiple of plan_length = 6"),
+        ({"plan_length": 5}, "`plan_length` must be a multiple of replan_every = 2"),
+        ({"learn_every": 8}, "`learn_every` must be a multiple of plan_length = 6"),
         ({"num_rollouts": 0}, "num_rollouts"),
         ({"retention": 0.0}, "retention"),
         ({"learn_every": "12"}, "learn_every"),
         ({"training": {"max_steps": 5}}, "max_steps"),
-        ({"min_score": float("nan")}, "min_score: a number is expected, not nan"),
-        ({"min_score": "a"}, "min_score: a number is expected, not 'a'"),
-        ({"prior": MarkovPrior(3, 1)}, "3 actions, and the world 4"),
+        ({"min_score": float("nan")}, "`min_score` must be a number, got nan"),
+        ({"min_score": "a"}, "`min_score` must be a number, got 'a'"),
+        ({"prior": MarkovPrior(3, 1)}, "must have 4 actions, as the world, got 3"),
     ],
 )
 def test_bad_agents(given, word):
@@ -464,7 +464,7 @@ def test_a_planner_of_an_expert_that_the_prior_would_replace_is_refused():
     plans = Plans(torch.randint(4, (30, 6), generator=seeded(0)), 4)
     prior = CombinedPrior(4, effort="fast").fit(plans)
     assert prior.given is None
-    with refuses("planner: it samples from an expert of the prior"):
+    with refuses("`planner` must"):
         agent(prior, planner=sampler(prior.alternatives[0]))
     agent(prior, planner=sampler(MarkovPrior(4, 1)), learn_every=None).run(6)
 
@@ -505,7 +505,7 @@ def test_a_network_goes_on_from_an_older_checkpoint(inside, tmp_path):
 
 
 def test_bad_runs():
-    with refuses("num_steps: a multiple of replan_every = 2"):
+    with refuses("`num_steps` must be a multiple of replan_every = 2"):
         agent().run(5)
     with refuses("num_steps"):
         agent().run(0)

@@ -289,7 +289,7 @@ def test_durations_and_conditions_stay_with_their_plans():
     for wrong in (torch.tensor([[1.0, -1], [1, 1]]), torch.tensor([[1.0, torch.inf], [1, 1]])):
         with refuses("durations[0, 1]"):
             Plans(plans.actions, 2, durations=wrong)
-    with refuses("durations: shape"):
+    with refuses("`durations` must have shape"):
         Plans(plans.actions, 2, durations=torch.ones(2))
     with refuses("condition"):
         Plans(plans.actions, 2, condition=torch.tensor([0.5, 1]))

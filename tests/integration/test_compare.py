@@ -45,9 +45,9 @@ BAD = [
     (["--seed", str(2**41)], "seed"),
 ]
 CURRICULUM_BAD = [
-    (["--lengths", "4", "4"], "lengths: each longer than the one before is expected, not 4 4"),
+    (["--lengths", "4", "4"], "`lengths` must"),
     (["--lengths", "0", "4"], "lengths"),
-    (["--lengths", "2", "4"], "lengths: more than"),
+    (["--lengths", "2", "4"], "`lengths` must"),
     (["--num-plans", "100"], "num_plans"),
     (["--worlds", "nowhere"], "worlds"),
     (["--processes", "0"], "processes"),
@@ -191,7 +191,7 @@ def test_bad_options_are_one_line(name, options, says, tmp_path, capsys):
 
 @pytest.mark.parametrize("name", ["worlds", "num_plans", "kinds"])
 def test_empty_lists_are_refused(name, tmp_path):
-    with pytest.raises(ValueError, match=f"{name}: at least one"):
+    with pytest.raises(ValueError, match=f"`{name}` must have at least one"):
         compare(out=str(tmp_path), **{name: []})
 
 

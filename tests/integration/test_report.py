@@ -137,7 +137,14 @@ def test_fewer_actions_than_the_prior_knows(end, named, suffix, tmp_path):
 def test_more_actions_than_the_prior_knows_are_one_line(tmp_path, capsys):
     folder = saved(MarkovPrior(3, 1), some_plans(), tmp_path / "prior")
     write_plans(Plans(torch.tensor([[0, 3], [1, 2]]), 4), tmp_path / "new.npz")
-    fails(capsys, tmp_path / "new.npz", [folder], tmp_path / "out", folder, "it knows 3 actions, and the plans have 4")
+    fails(
+        capsys,
+        tmp_path / "new.npz",
+        [folder],
+        tmp_path / "out",
+        folder,
+        "must know at least the 4 actions of the plans, got 3",
+    )
 
 
 @pytest.mark.parametrize("closed", [False, True])

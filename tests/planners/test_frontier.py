@@ -186,7 +186,7 @@ def test_refuses_worlds_and_priors():
     state = torch.zeros(2, dtype=torch.long)
     with refuses("deterministic"):
         FrontierPlanner(UniformPrior(3), 2, 2).plan(stochastic_world(0), state)
-    with refuses("4 actions", "3"):
+    with refuses("must have 3 actions", "got 4", "3"):
         FrontierPlanner(UniformPrior(4), 2, 2).plan(random_world(0), state)
     with refuses("state"):
         FrontierPlanner(UniformPrior(4), 2, 2).plan(gridworld(3, 3), state + 9)

@@ -92,7 +92,7 @@ def test_the_temperature_of_a_round_is_that_which_finds_most():
         found[heat] = float(last.plans.actions.float().mean())
     assert found[(1.0, 3.0)] == pytest.approx(found[(3.0,)], abs=0.05)
     assert found[(1.0, 3.0)] > found[(1.0,)] + 0.1
-    with refuses("temperatures: at least one"):
+    with refuses("`temperatures` must have at least one"):
         next(extend_horizon(MarkovPrior(2, 0), Plans(lefts, 2), world, (6,), num_starts=5, temperatures=()))
 
 
@@ -239,7 +239,7 @@ def test_each_layout_and_reward_map_is_a_group():
 
 def test_bad_input():
     world, plans = FromTheMiddle(), collect(ExhaustivePlanner(2), FromTheMiddle(), 10)
-    with refuses("lengths: integers of at least 1"):
+    with refuses("`lengths` must be integers of at least 1"):
         next(extend_horizon(MarkovPrior(2, 1), plans, world, (0,), num_starts=5))
     with refuses("none of 10 plans scored more than 99"):
         collect(ExhaustivePlanner(2), world, 10, min_score=99)

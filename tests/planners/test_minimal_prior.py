@@ -85,7 +85,7 @@ def test_planners_conform_with_a_minimal_prior(kind_of_planner):
 def test_what_does_not_fit_is_refused():
     with refuses("context", "none"):
         sample(CHAIN, 10, 4, torch.zeros(10, dtype=torch.long))
-    with refuses("4 actions"):
+    with refuses("must have 3 actions", "got 4"):
         SamplingPlanner(Minimal(torch.zeros(5, 4)), 3, 2).plan(random_world(0), torch.tensor([0]))
 
 

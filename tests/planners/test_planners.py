@@ -274,7 +274,10 @@ def test_states_of_more_than_one_number(planner):
             lambda: SamplingPlanner(UniformPrior(3), 2, 2, temperature=0).plan(random_world(0), torch.tensor([0])),
             "temp",
         ),
-        (lambda: SamplingPlanner(UniformPrior(4), 2, 2).plan(random_world(0), torch.tensor([0])), "4 actions"),
+        (
+            lambda: SamplingPlanner(UniformPrior(4), 2, 2).plan(random_world(0), torch.tensor([0])),
+            "must have 3 actions, as the world, got 4",
+        ),
         (lambda: SamplingPlanner(UniformPrior(3), 2, 2).plan(random_world(0), torch.tensor([-1])), "-1"),
         (lambda: oracle(random_world(0), torch.tensor([0]), 0), "length"),
         (lambda: oracle(random_world(0), torch.tensor([12]), 2), "12"),

@@ -86,7 +86,7 @@ def test_uniform_plans_are_legal():
 
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan"), "0.1", True])
 def test_shares_out_of_range(share):
-    with refuses("uniform_share: a number from 0 to 1"):
+    with refuses("`uniform_share` must be a number from 0 to 1"):
         SamplingPlanner(UniformPrior(2), 1, 1, uniform_share=share)
 
 
@@ -237,13 +237,13 @@ def test_weights_at_the_ends():
 def test_nothing_to_try():
     world, prior = bandit(), UniformPrior(2)
     state = torch.zeros(2, dtype=torch.long)
-    with refuses("prior: it has 3 actions, and the world 4"):
+    with refuses("`prior` must have 4 actions, as the world, got 3"):
         best_sampling(UniformPrior(3), gridworld(4, 4), torch.arange(16), 4, 8)
-    with refuses("temperatures: at least one"):
+    with refuses("`temperatures` must have at least one"):
         best_sampling(prior, world, state, 1, 4, temperatures=())
-    with refuses("temperature: a positive"):
+    with refuses("`temperature` must be a positive"):
         best_sampling(prior, world, state, 1, 4, temperatures=(0,))
-    with refuses("state: at least one start"):
+    with refuses("`state` must have at least one start"):
         best_sampling(prior, world, state[:0], 1, 4)
     with refuses("at most 0"):
         search_weights(torch.tensor([0.1]), 4)

@@ -374,7 +374,7 @@ def test_plans_are_named_as_in_the_file(tmp_path):
     (tmp_path / "c.csv").write_text("plan,action\n0,1\n1,0\n")
     assert read_plans(tmp_path / "c.csv").plan_names is None
     (tmp_path / "d.jsonl").write_text('{"actions": [0], "plan": "x"}\n{"actions": [1]}\n')
-    with pytest.raises(ValueError, match="line 2: plan: a name in every plan, or in none"):
+    with pytest.raises(ValueError, match="line 2: `plan` must be a name in every plan, or in none"):
         read_plans(tmp_path / "d.jsonl")
 
 

@@ -47,12 +47,12 @@ def test_the_seed_draws_the_folds():
 @pytest.mark.parametrize(
     ("group", "number", "words"),
     [
-        (None, 1, ("plans, 4", "not 1")),
-        (None, 0, ("not 0",)),
-        (None, -1, ("not -1",)),
-        (None, 5, ("plans, 4", "not 5")),
-        ([0, 0, 1, 1], 3, ("groups, 2", "not 3")),
-        ([7, 7, 7, 7], 5, ("plans, 4", "not 5")),
+        (None, 1, ("plans, 4", "got 1")),
+        (None, 0, ("got 0",)),
+        (None, -1, ("got -1",)),
+        (None, 5, ("plans, 4", "got 5")),
+        ([0, 0, 1, 1], 3, ("groups, 2", "got 3")),
+        ([7, 7, 7, 7], 5, ("plans, 4", "got 5")),
     ],
 )
 def test_bad_numbers_of_folds(group, number, words):

@@ -89,14 +89,14 @@ def test_a_prior_that_was_trained_with_them_makes_them_itself(tmp_path):
 
 
 def test_what_is_refused():
-    with refuses("number: an integer of at least 1"):
+    with refuses("`number` must be an integer of at least 1"):
         PastDurations.of(PLANS, 0)
     with refuses("durations: these plans have none"):
         PastDurations.of(Plans(ACTIONS, 3))
-    with refuses("none above 0 is known"):
+    with refuses("at least one above 0"):
         PastDurations.of(Plans(ACTIONS, 3, durations=torch.zeros(2, 4)))
     index = Plans(ACTIONS, 3, durations=DURATIONS, context=torch.tensor([0, 1]))
     with refuses("an index cannot stand beside past durations"):
         PastDurations(1, 0.0, 1.0).added_to(index)
-    with refuses("center, spread"):
+    with refuses("`center` must be between", "`spread` above 0"):
         PastDurations(1, nan, 1.0)

@@ -217,7 +217,7 @@ def test_durations_are_times_where_there_are_actions(wrong):
     actions = torch.zeros(2, 3, dtype=torch.long)
     kept = Plans(actions, 1, lengths, durations=durations).durations
     assert kept.nan_to_num(-1).tolist() == [[1.5, 0, 0], [-1, 2, 0]]
-    with refuses(f"durations[1, 2]: {wrong}; finite times"):
+    with refuses(f"`durations[1, 2]` must be finite times from 0, got {wrong}"):
         Plans(actions, 1, torch.tensor([2, 3]), durations=durations)
 
 
@@ -241,9 +241,9 @@ def test_steps_of_plans() -> None:
     assert plans.steps().actions.equal(plans.actions)
     once = Plans(plans.actions, 4, context=torch.tensor([5, 6, 7])).steps(2)
     assert once.context.tolist() == [[5, 5], [6, 6], [7, 7]]
-    with pytest.raises(ValueError, match="first: an integer of at least 0"):
+    with pytest.raises(ValueError, match="`first` must be an integer of at least 0"):
         plans.steps(-1)
-    with pytest.raises(ValueError, match="stop: at least 3"):
+    with pytest.raises(ValueError, match="`stop` must be at least 3"):
         plans.steps(3, 2)
 
 
@@ -257,11 +257,11 @@ def test_plans_keep_their_names():
     for part in plans.split(0.4, torch.Generator().manual_seed(0)):
         assert [("a", "b", "a")[int(first) // 2] for first in part.actions[:, 0]] == list(part.plan_names)
     for wrong, words in (
-        (["a", "b"], "3 are expected, one a plan, not 2"),
-        ("abc", "a list of texts"),
+        (["a", "b"], "`plan_names` must be 3, one a plan, got 2"),
+        ("abc", "`plan_names` must be a list of texts"),
         (["a", "b", "\ud83d"], ".*surrogate"),
     ):
-        with pytest.raises(ValueError, match=f"plan_names: {words}"):
+        with pytest.raises(ValueError, match=words):
             Plans(plans.actions, 6, plan_names=wrong)
 
 

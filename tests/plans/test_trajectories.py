@@ -116,14 +116,14 @@ def test_any_actions_there_and_back(rows):
         ({"actions": [[0], [1, 2]]}, ["actions", "fixed shape"]),
         ({"actions": [0, 3]}, ["action 3 of step 1", "0 to 2"]),
         ({"actions": [0, -1]}, ["action -1 of step 1"]),
-        ({"actions": [0], "observations": [1, 2, 3]}, ["3", "1 or 2 are expected"]),
+        ({"actions": [0], "observations": [1, 2, 3]}, ["3", "1 or 2"]),
         ({"actions": [0], "observations": {"a": [1]}}, ["Dict or Tuple", "flatten"]),
         ({"actions": [0], "observations": ([1], [2])}, ["Dict or Tuple"]),
         (steps([0], [{"a": 1}]), ["Dict or Tuple"]),
         (steps([0, 0], [(np.zeros(2), 1), (np.zeros(2), 1)]), ["fixed shape"]),
         (steps([0, 0], [[1.0], [1.0, 2.0]]), ["fixed shape"]),
-        ({"actions": [0], "observations": ["light"]}, ["observations are <U5"]),
-        ({"actions": [0], "observations": [-1]}, ["observation -1"]),
+        ({"actions": [0], "observations": ["light"]}, ["got <U5"]),
+        ({"actions": [0], "observations": [-1]}, ["observations from 0", "got -1"]),
         ({"actions": [0, 0], "observations": [[1.0], [np.nan]]}, ["step 1", "not finite"]),
         ({"actions": [0], "observations": [[1.0, 2.0]]}, ["2 features, not integers"]),
         ({"actions": [0]}, ["no observations", "trajectory 0"]),
@@ -135,7 +135,7 @@ def test_what_is_no_trajectory(trajectory, words):
 
 
 def test_arguments():
-    with refuses("the list is empty"):
+    with refuses("got an empty list"):
         from_trajectories([], 3)
     with refuses("num_actions", "0"):
         from_trajectories([{"actions": [0]}], 0)
@@ -216,7 +216,7 @@ def test_minari_refuses(minari, tmp_path, monkeypatch):
         write_minari(Plans(ACTIONS, 3, torch.tensor([3, 0])), "a-v0")
     with refuses("a-v0", "no plans"):
         write_minari(Plans(ACTIONS, 3)[:0], "a-v0")
-    with refuses("plans: Plans are expected", "not VectorPlans"):
+    with refuses("`plans` must be Plans", "got VectorPlans"):
         write_minari(VectorPlans(torch.zeros(2, 3, 1), [-1.0], [1.0]), "a-v0")
     with refuses("no id"):
         write_minari(Plans(ACTIONS, 3), "no id")

@@ -102,9 +102,9 @@ def test_refusals():
     """Bad arguments are named."""
     with refuses("switch"):
         infer(PRIORS, ACTIONS, switch=1.5)
-    with refuses("weights: shape"):
+    with refuses("`weights` must have shape"):
         infer(PRIORS, ACTIONS, weights=[1.0, 2.0])
-    with refuses("weights: finite"):
+    with refuses("`weights` must be finite"):
         infer(PRIORS, ACTIONS, weights=[1.0, -2.0, 3.0])
     with refuses("same number"):
         infer([UniformPrior(2), UniformPrior(3)], ACTIONS)
@@ -112,7 +112,7 @@ def test_refusals():
         infer([], ACTIONS)
     with refuses("their own"):
         infer(PRIORS, Plans(ACTIONS, 2), context=ACTIONS)
-    with refuses("posterior: shape"):
+    with refuses("`posterior` must have shape"):
         forecast(PRIORS, RING, torch.tensor([0]), torch.ones(1, 2), 1, 1, targets=torch.tensor([0]))
 
 

@@ -138,7 +138,7 @@ def test_forecasts(kind, takes, end, monkeypatch):
 
 def test_forecasts_of_other_plans_are_refused():
     prior = make("markov", "index a plan")
-    with refuses("3 actions", "not 4"):
+    with refuses("3 actions", "got 4"):
         next(iter(prior.forecasts(Plans(torch.zeros(2, 2).long(), 4, context=torch.zeros(2).long()))))
     with refuses("context"):
         next(iter(prior.forecasts(Plans(torch.zeros(2, 2).long(), A))))

@@ -266,7 +266,7 @@ def unused(state: Tensor) -> Tensor:
         # All of these before the first search:
         (tiles(4), None, {"epoch": 2, "teacher": AStarPlanner(unused)}, "epoch: not a setting"),
         (tiles(4), LogLinearPrior(4, 3), {"teacher": AStarPlanner(unused)}, "3 patterns"),
-        (tiles(4), LogLinearPrior(3, 3), {"teacher": AStarPlanner(unused)}, "it has 3 actions"),
+        (tiles(4), LogLinearPrior(3, 3), {"teacher": AStarPlanner(unused)}, "must have 4 actions"),
         (cube(), MarkovPrior(9, 1), {"problems": torch.tensor([5]), "guided": True}, "`guided` must be False"),
         (
             sliding_tiles(sliding_tiles(shape=(4, 4), scramble=500).reset(3, seeded(0))),

@@ -186,9 +186,9 @@ def test_each_plan_goes_on_from_its_own_past_under_its_own_context(per):
     ("past", "words"),
     [
         (torch.tensor([0, 3]), "past[1]: 3"),
-        (torch.tensor([0.5]), "past: integers are expected"),
-        (torch.zeros(4, 2, dtype=torch.long), "past: actions [T] or [5, T] are expected, not [4, 2]"),
-        (torch.tensor(1), "past: actions [T] or [5, T] are expected, not []"),
+        (torch.tensor([0.5]), "`past` must be integers"),
+        (torch.zeros(4, 2, dtype=torch.long), "`past` must be actions [T] or [5, T], got [4, 2]"),
+        (torch.tensor(1), "`past` must be actions [T] or [5, T], got []"),
     ],
 )
 def test_a_past_that_cannot_be(past, words):
@@ -464,7 +464,7 @@ def test_in_a_world_of_features():
 @pytest.mark.parametrize(
     ("change", "word"),
     [
-        ({"prior": UniformPrior(4)}, "4 actions"),
+        ({"prior": UniformPrior(4)}, "must have 3 actions, as the world, got 4"),
         ({"num_plans": -1}, "-1"),
         ({"length": -1}, "-1"),
         ({"temperature": 0.0}, "temperature"),

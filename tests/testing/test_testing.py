@@ -246,7 +246,7 @@ def test_a_broken_prior_fails_with_a_message(broken: Callable[[], Prior], messag
         check_prior(broken())
 
 
-@pytest.mark.parametrize(("given", "message"), [(None, "not NoneType"), (Forgetful, "the class Forgetful")])
+@pytest.mark.parametrize(("given", "message"), [(None, "got NoneType"), (Forgetful, "the class Forgetful")])
 def test_what_is_no_prior_fails_with_a_message(given: object, message: str) -> None:
     with pytest.raises(AssertionError, match=f"`fit` has to return it.*{message}"):
         check_prior(given)  # type: ignore[arg-type]
@@ -534,7 +534,7 @@ def test_a_world_without_actions_and_what_is_no_world_are_refused() -> None:
     world.num_actions = np.int64(4)  # type: ignore[assignment]
     check_world(world)
     world.num_actions = 0
-    with pytest.raises(AssertionError, match="num_actions: an integer above 0 is expected, not 0"):
+    with pytest.raises(AssertionError, match="`num_actions` must be an integer above 0, got 0"):
         check_world(world)
-    with pytest.raises(AssertionError, match="a World is expected, not int"):
+    with pytest.raises(AssertionError, match="`world` must be a World, got int"):
         check_world(3)  # type: ignore[arg-type]

@@ -59,7 +59,7 @@ def test_the_names_kept_are_those_of_the_plans_learned_from():
 @BOTH
 def test_plans_that_are_no_validation_are_refused(name):
     plans = Plans(some(0).actions, A, action_names=("a", "b", "c"))
-    with refuses("not 7"):
+    with refuses("got 7"):
         fitted(name, plans, Plans(torch.zeros(4, 3, dtype=torch.long), 7))
     with refuses("validation", "action_names"):
         fitted(name, plans, Plans(plans.actions, A, action_names=("b", "a", "c")))
@@ -69,5 +69,5 @@ def test_plans_that_are_no_validation_are_refused(name):
 
 def test_other_plans_are_refused_by_the_trainer_itself():
     plans, other = some(0), Plans(torch.zeros(4, 3, dtype=torch.long), 2)
-    with refuses("validation: 3 actions are expected, not 2"):
+    with refuses("`validation` must have 3 actions, got 2"):
         train(GRUPrior(A, 8), plans, Settings(validation=other, progress=False), 0)

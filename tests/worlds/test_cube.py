@@ -156,11 +156,11 @@ def test_a_planner_solves_what_is_near():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: cube("whole"), 'turns: "half" or "quarter" is expected, not \'whole\''),
-        (lambda: cube(reward="time"), 'reward: "solved" or "distance" is expected'),
-        (lambda: cube(scramble=-1), "scramble: an integer of at least 0 is expected, not -1"),
+        (lambda: cube("whole"), '`turns` must be "half" or "quarter", got \'whole\''),
+        (lambda: cube(reward="time"), '`reward` must be "solved" or "distance"'),
+        (lambda: cube(scramble=-1), "`scramble` must be an integer of at least 0, got -1"),
         (lambda: cube().distance(torch.tensor([NUM_STATES])), "state[0]: 3674160 is out of range"),
-        (lambda: cube().check_state(torch.zeros(3)), "state: int64 of shape [B] is expected"),
+        (lambda: cube().check_state(torch.zeros(3)), "`state` must be int64 of shape [B]"),
         (lambda: cube().rollout(torch.tensor([-1]), torch.zeros(1, 1, 1, dtype=torch.long)), "-1 is out of range"),
     ],
 )

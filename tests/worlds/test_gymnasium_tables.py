@@ -134,18 +134,18 @@ def test_an_end_that_is_also_passed_through_gets_a_state_of_its_own():
     [
         (lambda: from_gymnasium("Nope-v0"), ["Nope-v0 cannot be made", "doesn't exist"]),
         (lambda: from_gymnasium("FrozenLake-v1", colour="red"), ["cannot be made", "colour"]),
-        (lambda: from_gymnasium("Pendulum-v1"), ["actions of the space Box", "discrete actions are expected"]),
-        (lambda: from_gymnasium(3), ["a gymnasium.Env is expected, not int"]),
+        (lambda: from_gymnasium("Pendulum-v1"), ["those of the space Box", "discrete actions"]),
+        (lambda: from_gymnasium(3), ["a gymnasium.Env, got int"]),
         (lambda: from_gymnasium(Corridor(), colour="red"), ["colour: options make an environment from its name"]),
         (lambda: from_gymnasium(Corridor(), method="table"), ['method="table"', "attribute P"]),
         (lambda: from_gymnasium("Taxi-v4", fickle_passenger=True), ["fickle_passenger"]),
-        (lambda: from_gymnasium("Taxi-v4", method="guess"), ["method:", "'guess'"]),
-        (lambda: from_gymnasium("Taxi-v4", starts="all"), ["starts:", "'all'"]),
+        (lambda: from_gymnasium("Taxi-v4", method="guess"), ["`method` must", "'guess'"]),
+        (lambda: from_gymnasium("Taxi-v4", starts="all"), ["`starts` must", "'all'"]),
         (lambda: from_gymnasium("Taxi-v4", seeds=[1, 2]), ["seeds: a table read from P has one layout"]),
-        (lambda: from_gymnasium("CartPole-v1", seeds=[]), ["seeds: one or more integers"]),
-        (lambda: from_gymnasium("CartPole-v1", seed=-1), ["seeds: one or more integers", "[-1]"]),
+        (lambda: from_gymnasium("CartPole-v1", seeds=[]), ["`seeds` must be one or more integers"]),
+        (lambda: from_gymnasium("CartPole-v1", seed=-1), ["`seeds` must be one or more integers", "[-1]"]),
         (lambda: from_gymnasium("CartPole-v1", starts="any"), ['starts: "any" needs a table']),
-        (lambda: from_gymnasium("CartPole-v1", horizon=0), ["horizon: an integer of at least 1"]),
+        (lambda: from_gymnasium("CartPole-v1", horizon=0), ["`horizon` must be an integer of at least 1"]),
     ],
 )
 def test_refusals(call, words):
@@ -162,9 +162,9 @@ def test_an_episodic_world_is_checked():
     assert make(ended=good).ended.tolist() == [True, False]
     with refuses("ended: every action must stay"):
         make(ended=~good)
-    with refuses("starts: one entry for each of 2 states is expected, not 3"):
+    with refuses("`starts` must be one entry for each of 2 states, got 3"):
         make(ended=good, starts=(1.0, 1.0, 1.0))
-    with refuses("starts: probabilities are expected"):
+    with refuses("`starts` must be probabilities"):
         make(ended=good, starts=(0.0, 0.0))
     two = make(ended=good, reward=((0.0, 0.0), (0.0, 0.0)), starts=(0.0, 1.0))
     assert sorted(two.reset(100, seeded(0)).unique().tolist()) == [1, 3]

@@ -155,7 +155,7 @@ def test_who_follows_the_direction_is_at_the_goal(egocentric):
     square = (world.layout(state) * 9 + row) * 7 + column
     reward = world.reward[world.reward_map(state), square * (4 if egocentric else 1)]
     assert reward.tolist() == [1.0] * 300
-    with refuses("not a torus"):
+    with refuses("got a torus"):
         goal_direction(gridworld(4, 4, edges="torus"))
 
 
@@ -236,7 +236,7 @@ def test_an_open_grid_is_as_it_was():
         (lambda: maze(view=0), ["view", "0"]),
         (lambda: maze(view=True), ["view", "True"]),
         (lambda: local_view(maze(), 0), ["view", "0"]),
-        (lambda: egocentric(maze(egocentric=True)), ["world", "headings already"]),
+        (lambda: egocentric(maze(egocentric=True)), ["world", "agents have headings"]),
         (lambda: maze().heading(torch.tensor([0])), ["heading", "egocentric"]),
         (lambda: GridWorld(4, 5, "wall", torch.zeros(1, 20), walls=WALLS), ["reward", "[1, 20]"]),
         (lambda: GridWorld(4, 4, "wall", torch.zeros(1, 48), walls=WALLS), ["walls", "[M, 4, 4]", "[3, 4, 5]"]),

@@ -38,7 +38,7 @@ def check_vector_planner(make: Callable[..., VectorPlanner], seed: int = 0) -> N
 
     def made(prior: VectorPrior, share: float, length: int, num_plans: int) -> VectorPlanner:
         planner = make(length, num_plans, prior=prior, prior_share=share)
-        require(isinstance(planner, VectorPlanner), f"make: a VectorPlanner is expected, not {type(planner).__name__}")
+        require(isinstance(planner, VectorPlanner), f"`make` must be a VectorPlanner, got {type(planner).__name__}")
         return planner
 
     world = _Mass()

@@ -88,9 +88,9 @@ def read_plans(
         ('eat', 'rest', 'walk')
     """
     if not isinstance(path, str | os.PathLike):
-        raise ValueError(f"path: the name of a file is expected, not {type(path).__name__}")
+        raise ValueError(f"`path` must be the name of a file, got {type(path).__name__}")
     if not isinstance(columns, Columns | Mapping | None):
-        raise ValueError(f"columns: what each holds is expected, as in {{'action': 'behaviour'}}, not {columns!r}")
+        raise ValueError(f"`columns` must say what each holds, as in {{'action': 'behaviour'}}, got {columns!r}")
     given = columns if isinstance(columns, Columns | None) else {k: v for k, v in columns.items() if v is not None}
     table: dict[str, Any] = {"columns": given} if given not in (None, {}, Columns()) else {}
     table |= {"missing": missing} if missing != "gap" else {}
@@ -132,7 +132,7 @@ def write_plans(plans: Plans, path: str | os.PathLike[str], *, layout: str | Non
     """
     check_are_plans(plans)
     if not isinstance(path, str | os.PathLike):
-        raise ValueError(f"path: a file is expected, not {type(path).__name__}")
+        raise ValueError(f"`path` must be a file, got {type(path).__name__}")
     place = Path(path)
     suffix = _suffix(place)
     if layout is not None and FILES[suffix].read is not read_csv:

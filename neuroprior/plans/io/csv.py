@@ -383,7 +383,7 @@ def _cells(rows: list[Row], columns: list[int]) -> list[str]:
 def write_csv(plans: Plans, path: Path, layout: str | None) -> None:
     """Write a CSV file; `.tsv` has tabs."""
     if layout not in (None, "plan", "step"):
-        raise ValueError(f"layout: 'plan', 'step' or None is expected, not {layout!r}")
+        raise ValueError(f"`layout` must be 'plan', 'step' or None, got {layout!r}")
     check_readable(plans, str(path), "CSV")
     lengths = plans.mask().sum(1)
     varies = plans.context is not None and constant_context(plans) is None

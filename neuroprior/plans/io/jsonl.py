@@ -152,7 +152,7 @@ class _Rows:
         check_names(self.num_actions, own if names is None else None)
         self.end = header.get("end")
         if self.end is not None and type(self.end) is not int:
-            raise ValueError(f"end: an action's number is expected, not {_short(self.end)}")
+            raise ValueError(f"`end` must be an action's number, got {_short(self.end)}")
         self.actions = Column("action", self.action_names, None if own is not None else self.num_actions)
         self.of_plans = {what: Column(what, _header_names(header, f"{what}_names")) for what in OF_PLANS}
         self.contexts = _Contexts(_header_names(header, "context_names"))
@@ -185,9 +185,9 @@ class _Rows:
             self._check_entry(what, row.get(what))
         durations = self._durations(row.get("durations"), len(actions))
         if (plan_name := row.get("plan")) is not None and type(plan_name) not in (int, str):
-            raise ValueError(f"plan: {_short(plan_name)}; a name or a number is expected")
+            raise ValueError(f"`plan` must be a name or a number, got {_short(plan_name)}")
         if (plan_name is not None) != (len(self.plan_names) == len(self.lines)) and self.lines:
-            raise ValueError("plan: a name in every plan, or in none, is expected")
+            raise ValueError("`plan` must be a name in every plan, or in none")
         self.contexts.add(row.get("context"))
         self.actions.add(actions)
         for what, column in self.of_plans.items():
@@ -204,7 +204,7 @@ class _Rows:
         """Check the group or the condition of a plan."""
         kind = self.kind_of.setdefault(what, type(entry)) if not self.lines else self.kind_of[what]
         if type(entry) is not kind or kind not in (int, str, type(None)):
-            raise ValueError(f"{what}: {_short(entry)}; an integer or a name in every plan, or in none, is expected")
+            raise ValueError(f"`{what}` must be an integer or a name in every plan, or in none, got {_short(entry)}")
         if type(entry) is int and not -LARGEST_INTEGER < entry < LARGEST_INTEGER:
             raise ValueError(f"{what}: {_short(entry)} is too large")
 
@@ -213,14 +213,14 @@ class _Rows:
         if not self.lines and entry is not None:
             self.durations = array("f")
         if (entry is None) != (self.durations is None):
-            raise ValueError("durations: a list in every plan, or in none, is expected")
+            raise ValueError("`durations` must be a list in every plan, or in none")
         if entry is None:
             return []
         if type(entry) is not list or len(entry) != length:
-            raise ValueError(f"durations: a list of {length} times, one for each action, is expected")
+            raise ValueError(f"`durations` must be a list of {length} times, one for each action")
         for value in entry:
             if value is not None and (type(value) not in (int, float) or not 0 <= value <= LARGEST_FLOAT):
-                raise ValueError(f"durations: {_short(value)}; times of at least 0, or null, are expected")
+                raise ValueError(f"`durations` must be times of at least 0, or null, got {_short(value)}")
         return [math.nan if value is None else value for value in entry]
 
     def plans(self) -> Plans:
@@ -274,7 +274,7 @@ def _header_names(header: dict[str, Any], key: str) -> Names | None:
     if names is None:
         return None
     if type(names) is not list or not names or not all(type(name) is str for name in names):
-        raise ValueError(f"{key}: a list of names is expected, not {_short(names)}")
+        raise ValueError(f"`{key}` must be a list of names, got {_short(names)}")
     check_distinct(key, names)
     return tuple(names)
 
@@ -365,7 +365,7 @@ def _kind(value: Any) -> str:
 def _check_numbers(values: list[Any], largest: float) -> None:
     if not set(map(type, values)) <= {int, float}:
         wrong = next(value for value in values if type(value) not in (int, float))
-        raise ValueError(f"context: {_short(wrong)} is not a number, where numbers are expected")
+        raise ValueError(f"`context` must be numbers here, got {_short(wrong)}")
     if not -largest <= min(values) <= max(values) <= largest:
         raise ValueError(f"context: {_short(max(values, key=abs))} is too large")
 

@@ -41,7 +41,7 @@ def from_trajectories(trajectories: Iterable[Any], num_actions: int, *, observat
     """
     check_names(num_actions, None)
     if observations not in ("context", None):
-        raise ValueError(f"observations: 'context' or None is expected, not {observations!r}")
+        raise ValueError(f"`observations` must be 'context' or None, got {observations!r}")
     check_are_several(trajectories)
     actions: list[Integers] = []
     observed: list[NDArray[Any] | None] = []
@@ -52,7 +52,7 @@ def from_trajectories(trajectories: Iterable[Any], num_actions: int, *, observat
         if observations is not None:
             observed.append(None if made is None else observations_of(made, len(actions[-1]), place))
     if not actions:
-        raise ValueError("trajectories: at least one is expected; the list is empty")
+        raise ValueError("`trajectories` must have at least one trajectory, got an empty list")
     lengths = np.array([len(part) for part in actions])
     context = joined(observed)
     return assembled("trajectories", lengths, np.concatenate(actions), num_actions, context=context, per_step=True)
@@ -76,7 +76,7 @@ def to_trajectories(plans: Plans, kind: Literal["dicts", "imitation"] = "dicts")
         [{'actions': array([0, 1]), 'observations': array([5, 3])}]
     """
     if kind not in ("dicts", "imitation"):
-        raise ValueError(f"kind: 'dicts' or 'imitation' is expected, not {kind!r}")
+        raise ValueError(f"`kind` must be 'dicts' or 'imitation', got {kind!r}")
     actions, lengths = plans.actions.long().cpu().numpy(), plans.mask().sum(1).tolist()
     context = plans.context
     found = [{"actions": row[:length].copy()} for row, length in zip(actions, lengths, strict=True)]
@@ -104,9 +104,9 @@ def to_trajectories(plans: Plans, kind: Literal["dicts", "imitation"] = "dicts")
 def check_are_several(trajectories: Any) -> None:
     """Raise ValueError for a dict, or a single trajectory that is not in a list."""
     if isinstance(trajectories, Mapping) and "actions" not in trajectories:
-        raise ValueError("trajectories: a list of them is expected, not a dict")
+        raise ValueError("`trajectories` must be a list of trajectories, got a dict")
     if isinstance(trajectories, Mapping) or hasattr(trajectories, "actions") or hasattr(trajectories, "acts"):
-        raise ValueError("trajectories: a list of them is expected, not a single one; put it in a list")
+        raise ValueError("`trajectories` must be a list of trajectories, got one; put it in a list")
 
 
 def parts_of(trajectory: Any, place: str) -> tuple[Any, Any]:
@@ -120,13 +120,11 @@ def parts_of(trajectory: Any, place: str) -> tuple[Any, Any]:
     if hasattr(trajectory, "acts"):
         return trajectory.acts, getattr(trajectory, "obs", None)
     if not isinstance(trajectory, list | tuple):
-        raise ValueError(
-            f"{place}: a list of steps or a dict with 'actions' is expected, not {type(trajectory).__name__}"
-        )
+        raise ValueError(f"`{place}` must be a list of steps or a dict with 'actions', got {type(trajectory).__name__}")
     for number, step in enumerate(trajectory):
         if not isinstance(step, list | tuple) or len(step) != 6:
             raise ValueError(
-                f"{place}: step {number}: (observation, action, reward, terminated, truncated, info) is expected"
+                f"`{place}` must be step {number}: (observation, action, reward, terminated, truncated, info)"
             )
     return [step[1] for step in trajectory], [step[0] for step in trajectory]
 
@@ -137,7 +135,7 @@ def _actions(values: Any, num_actions: int, place: str) -> Integers:
         return np.zeros(0, np.int64)
     if actions.dtype.kind not in "iu" or actions.ndim != 1:
         raise ValueError(
-            f"{place}: actions are {actions.dtype} of shape {list(actions.shape)}; one integer per step is expected"
+            f"`{place}` must have one integer per step as actions, got {actions.dtype} of shape {list(actions.shape)}"
             " (discrete actions); of vectors see vector_plans_from_trajectories"
         )
     wrong = np.flatnonzero((actions < 0) | (actions >= num_actions))
@@ -158,14 +156,14 @@ def observations_of(values: Any, length: int, place: str) -> NDArray[Any]:
     observed = array_of(values, f"{place}: observations")
     if observed.ndim == 0 or len(observed) not in (length, length + 1):
         shown = list(observed.shape)[:1] or "one"
-        raise ValueError(f"{place}: {shown} observations for {length} actions; {length} or {length + 1} are expected")
+        raise ValueError(f"`{place}` must have {length} or {length + 1} observations for {length} actions, got {shown}")
     observed = observed[:length]
     if observed.ndim == 1 and observed.dtype.kind in "iu":
         if observed.size and not 0 <= int(observed.min()) <= int(observed.max()) < LARGEST_INTEGER:
-            raise ValueError(f"{place}: observation {observed.min()} is out of range; 0 or more is expected")
+            raise ValueError(f"`{place}` must have observations from 0, got {observed.min()}")
         return observed.astype(np.int64)
     if observed.dtype.kind not in "iufb":
-        raise ValueError(f"{place}: observations are {observed.dtype}; integers or arrays of numbers are expected")
+        raise ValueError(f"`{place}` must have integers or arrays of numbers as observations, got {observed.dtype}")
     width = int(np.prod(observed.shape[1:]))
     wide = np.result_type(observed, np.float32).itemsize > 4
     features = observed.reshape(length, width).astype(np.float64 if wide else np.float32)
@@ -206,7 +204,7 @@ def array_of(values: Any, place: str) -> NDArray[Any]:
     try:
         array = np.asarray(values)
     except (ValueError, TypeError, OverflowError, RuntimeError) as error:
-        raise ValueError(f"{place}: one number or one array of a fixed shape per step is expected") from error
+        raise ValueError(f"`{place}` must be one number or one array of a fixed shape per step") from error
     if array.dtype.kind == "O":
-        raise ValueError(f"{place}: {array.dtype} values; numbers are expected")
+        raise ValueError(f"`{place}` must be numbers, got {array.dtype} values")
     return array

@@ -99,13 +99,13 @@ class ContextTreePrior(HistoryPrior):
     ) -> None:
         check_count("depth", depth, 0)
         if depth > MOST_DEPTH:
-            raise ValueError(f"depth: at most {MOST_DEPTH} is expected, not {depth}")
+            raise ValueError(f"`depth` must be at most {MOST_DEPTH}, got {depth}")
         if beta is not None and (not is_number(beta) or not 0 < beta < 1):
-            raise ValueError(f"beta: a number between 0 and 1 is expected, not {beta!r}")
+            raise ValueError(f"`beta` must be a number between 0 and 1, got {beta!r}")
         if alpha is not None and (not is_number(alpha) or not 0 < alpha < float("inf")):
-            raise ValueError(f"alpha: a positive finite number is expected, not {alpha!r}")
+            raise ValueError(f"`alpha` must be a positive finite number, got {alpha!r}")
         if base not in ("frequencies", "uniform"):
-            raise ValueError(f'base: "frequencies" or "uniform" is expected, not {base!r}')
+            raise ValueError(f'`base` must be "frequencies" or "uniform", got {base!r}')
         check_sizes(num_actions=num_actions)
         self.depth, self.alpha, self.base = depth, alpha, base
         self.beta = 1 - 1 / max(num_actions, 2) if beta is None else float(beta)

@@ -92,11 +92,11 @@ class MarkovPrior(HistoryPrior):
     ) -> None:
         check_count("order", order, 0)
         if not is_number(smoothing) or not 0 < smoothing < float("inf"):
-            raise ValueError(f"smoothing: a positive finite number is expected, not {smoothing!r}")
+            raise ValueError(f"`smoothing` must be a positive finite number, got {smoothing!r}")
         if initial not in ("joint", "lower"):
-            raise ValueError(f'initial: "joint" or "lower" is expected, not {initial!r}')
+            raise ValueError(f'`initial` must be "joint" or "lower", got {initial!r}')
         if backoff not in BACKOFFS:
-            raise ValueError(f"backoff: one of {', '.join(map(repr, BACKOFFS))} is expected, not {backoff!r}")
+            raise ValueError(f"`backoff` must be one of {', '.join(map(repr, BACKOFFS))}, got {backoff!r}")
         self.order, self.smoothing, self.initial, self.backoff = order, float(smoothing), initial, backoff
         self.openings = initial == "joint"
         super().__init__(num_actions, order, num_contexts)
@@ -117,7 +117,7 @@ class MarkovPrior(HistoryPrior):
             ValueError: the order is 0, or the prior takes a context.
         """
         if self.order == 0 or self.takes_context:
-            raise ValueError("transition_matrix: a prior of order 1 or more without context is expected")
+            raise ValueError("`transition_matrix` must be a prior of order 1 or more without context")
         return self.log_probs[self.next_node[0].long()].exp()
 
 

@@ -48,7 +48,7 @@ DEPTH = 10
 def check_effort(effort: object) -> None:
     """Raise ValueError for what is no `Effort`."""
     if effort not in list(NETWORKS):
-        raise ValueError(f"effort: one of {', '.join(NETWORKS)} is expected, not {effort!r}")
+        raise ValueError(f"`effort` must be one of {', '.join(NETWORKS)}, got {effort!r}")
 
 
 def fitted_experts(

@@ -165,7 +165,7 @@ class CombinedPrior(MixturePrior):
             self.experts = nn.ModuleList(kept).to(self.device)
         super().restore(learned)
         if not isinstance(learned["tried"], int) or learned["tried"] < 0:
-            raise ValueError(f"tried: an integer of at least 0 is expected, not {learned['tried']!r}")
+            raise ValueError(f"`tried` must be an integer of at least 0, got {learned['tried']!r}")
         self.tried = learned["tried"]
         for name in ("spare", "left_out"):
             described_ones = learned.get(name, [])
@@ -176,7 +176,7 @@ class CombinedPrior(MixturePrior):
             setattr(self, name, nn.ModuleList(aside).to(self.device))
         every, order = [*self.alternatives, *priors_in(self.left_out)], learned["given"]
         if order is not None and sorted(order) != list(range(len(every))):
-            raise ValueError(f"given: the numbers of {len(every)} experts are expected, not {order!r}")
+            raise ValueError(f"`given` must be the numbers of {len(every)} experts, got {order!r}")
         self.given = None if order is None else [[every[number] for number in order]]
         self._allocate()
 

@@ -67,7 +67,7 @@ class MixturePrior(Prior):
         context_size: int | None = None,
     ) -> None:
         if not experts:
-            raise ValueError("experts: at least one is expected")
+            raise ValueError("`experts` must have at least one prior")
         check_share("share", share)
         made = [as_prior(e) for e in experts]
         for number, expert in enumerate(made):
@@ -113,7 +113,7 @@ class MixturePrior(Prior):
     def restore(self, learned: dict[str, Any]) -> None:
         super().restore(learned)
         if not isinstance(learned["share"], float) or not 0 <= learned["share"] <= 1:
-            raise ValueError(f"share: a number between 0 and 1 is expected, not {learned['share']!r}")
+            raise ValueError(f"`share` must be a number between 0 and 1, got {learned['share']!r}")
         self.share = learned["share"]
         for expert, own in zip(self._experts(), learned["experts"], strict=True):
             expert.restore(own)
@@ -276,7 +276,7 @@ def divided(plans: Plans, validation: Plans | float | None, generator: torch.Gen
     if isinstance(validation, Plans):
         check_alike(plans, validation)
         if not bool(validation.mask().any()):
-            raise ValueError("validation: at least one plan with an action is expected")
+            raise ValueError("`validation` must have at least one plan with an action")
         return plans, validation
     plans = plans[plans.mask().any(1)]
     if validation is None:

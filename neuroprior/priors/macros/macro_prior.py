@@ -58,17 +58,17 @@ class MacroPrior(Prior):
     def __init__(self, num_actions: int, inner: Prior | Mapping[str, Any], by: Criterion = "count") -> None:
         check_sizes(num_actions=num_actions)
         if by not in CRITERIA:
-            raise ValueError(f"by: one of {', '.join(map(repr, CRITERIA))} is expected, not {by!r}")
+            raise ValueError(f"`by` must be one of {', '.join(map(repr, CRITERIA))}, got {by!r}")
         made = as_prior(inner)
         if made.num_actions <= num_actions:
             raise ValueError(
-                f"inner: a prior over more than {num_actions} actions is expected, one for each macro;"
-                f" it has {made.num_actions}"
+                f"`inner` must be a prior over more than {num_actions} actions, one for each macro,"
+                f" got {made.num_actions}"
             )
         if isinstance(made, MacroPrior):
-            raise ValueError("inner: a prior without macros is expected; give this one more of them")
+            raise ValueError("`inner` must be a prior without macros; give this one more of them")
         if made.takes_context:
-            raise ValueError("inner: a prior without context is expected: a macro is one step with many contexts")
+            raise ValueError("`inner` must be a prior without context: a macro is one step with many contexts")
         super().__init__(num_actions)
         self.inner, self.by = made, by
         self._set_macros([])
@@ -92,7 +92,7 @@ class MacroPrior(Prior):
         macros = [Macro(tuple(actions), count, gain) for actions, count, gain in learned["macros"]]
         known = all(isinstance(a, int) and 0 <= a < self.num_actions for macro in macros for a in macro.actions)
         if not known or len(macros) > self.num_macros or any(len(macro.actions) < 2 for macro in macros):
-            raise ValueError(f"macros: at most {self.num_macros} sequences of at least two actions are expected")
+            raise ValueError(f"`macros` must be at most {self.num_macros} sequences of at least two actions")
         self._set_macros(macros)
         self._inner().restore(learned["inner"])
 

@@ -72,7 +72,7 @@ def macros_of(plans: Plans, num_macros: int, by: Criterion, *others: Plans) -> t
     for some in (plans, *others):
         check_are_plans(some)
     if by not in CRITERIA:
-        raise ValueError(f"by: one of {', '.join(map(repr, CRITERIA))} is expected, not {by!r}")
+        raise ValueError(f"`by` must be one of {', '.join(map(repr, CRITERIA))}, got {by!r}")
     if any(some.end is not None for some in (plans, *others)):
         raise ValueError("plans: an end symbol cannot be part of a macro; learn from plans without one")
     symbols = [some.actions.long().masked_fill(~some.mask(), -1) for some in (plans, *others)]

@@ -121,7 +121,7 @@ class NeuralPrior(Prior):
         if window is not None:
             check_count("window", window, 0)
         if dropout is not None and (not is_number(dropout) or not 0 <= dropout < 1):
-            raise ValueError(f"dropout: a share from 0 to below 1 is expected, not {dropout!r}")
+            raise ValueError(f"`dropout` must be a share from 0 to below 1, got {dropout!r}")
         check_seed(seed)
         self._given_window = self.window = window
         check_sizes(lags=1 if lags is None else lags)

@@ -67,7 +67,7 @@ class TransformerPrior(NeuralPrior):
     ) -> None:
         check_sizes(width=width, num_layers=num_layers, num_heads=num_heads)
         if width % (2 * num_heads):
-            raise ValueError(f"width: a multiple of 2 * num_heads = {2 * num_heads} is expected, not {width}")
+            raise ValueError(f"`width` must be a multiple of 2 * num_heads = {2 * num_heads}, got {width}")
         check_memory(48 * num_layers * width**2, num_layers=num_layers, width=width)
         self.num_heads = num_heads
         self.span: int | None = None

@@ -145,10 +145,10 @@ class SwitchingPrior(HistoryPrior):
         numbers: dict[str, object] = {"smoothing": smoothing, "stay": stay, "tolerance": tolerance}
         for name, value in numbers.items():
             if not is_number(value) or not 0 <= value < inf:
-                raise ValueError(f"{name}: a finite number of at least 0 is expected, not {value!r}")
+                raise ValueError(f"`{name}` must be a finite number of at least 0, got {value!r}")
         check_share("sharing", sharing)
         if switching not in ("context", "constant"):
-            raise ValueError(f'switching: "context" or "constant" is expected, not {switching!r}')
+            raise ValueError(f'`switching` must be "context" or "constant", got {switching!r}')
         self.num_modes, self.order, self.phases, self.folds, self.restarts = num_modes, order, phases, folds, restarts
         self.smoothing, self.sharing, self.stay = float(smoothing), float(sharing), float(stay)
         self.switching: Literal["context", "constant"] = switching
@@ -340,7 +340,7 @@ class SwitchingPrior(HistoryPrior):
             ValueError: there is no such mode.
         """
         if isinstance(mode, bool) or not isinstance(mode, int) or not 0 <= mode < self.num_modes:
-            raise ValueError(f"mode: an integer from 0 to {self.num_modes - 1} is expected, not {mode!r}")
+            raise ValueError(f"`mode` must be an integer from 0 to {self.num_modes - 1}, got {mode!r}")
         phases = self.first.view(self.num_modes, self.phases)[mode]
         first = torch.zeros_like(self.first).view(self.num_modes, self.phases)
         first[mode] = phases / phases.sum() if phases.sum() > 0 else 1 / self.phases

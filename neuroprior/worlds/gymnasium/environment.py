@@ -33,12 +33,12 @@ def open_environment(env: Any, options: dict[str, Any]) -> Any:
     if isinstance(env, str):
         env = _make(gymnasium, env, options)
     elif not isinstance(env, gymnasium.Env):
-        raise ValueError(f"env: the name of an environment or a gymnasium.Env is expected, not {type(env).__name__}")
+        raise ValueError(f"`env` must be the name of an environment or a gymnasium.Env, got {type(env).__name__}")
     elif options:
         raise ValueError(f"{next(iter(options))}: options make an environment from its name; this one is made already")
     env = _without_limits(gymnasium, env)
     if not isinstance(env.action_space, gymnasium.spaces.Discrete):
-        raise ValueError(f"env: actions of the space {env.action_space}; discrete actions are expected")
+        raise ValueError(f"`env` must have discrete actions, got those of the space {env.action_space}")
     return env
 
 

@@ -124,7 +124,7 @@ class SteppedWorld(World):
     def check_state(self, state: Tensor) -> None:
         width = _ACTIONS + self.horizon
         if not isinstance(state, Tensor) or state.dim() != 2 or state.shape[1] != width or not is_integer(state):
-            raise ValueError(f"state: integers of shape [B, {width}] are expected, such as reset returns")
+            raise ValueError(f"`state` must be integers of shape [B, {width}], such as reset returns")
         check_range("state (seed)", state[:, _SEED], len(self.seeds), "seeds")
         check_range("state (length)", state[:, _LENGTH], self.horizon + 1, "lengths")
         check_range("state (ended)", state[:, _ENDED], 2, "values")

@@ -86,13 +86,13 @@ def from_gymnasium(
         (4, True)
     """
     if method not in METHODS:
-        raise ValueError(f'method: "auto", "table", "enumerate" or "step" is expected, not {method!r}')
+        raise ValueError(f'`method` must be "auto", "table", "enumerate" or "step", got {method!r}')
     if starts not in ("initial", "any"):
-        raise ValueError(f'starts: "initial" or "any" is expected, not {starts!r}')
+        raise ValueError(f'`starts` must be "initial" or "any", got {starts!r}')
     check_sizes(max_states=max_states, horizon=horizon)
     given = [seed] if seeds is None else list(seeds)
     if not given or any(not isinstance(one, int | np.integer) or one < 0 for one in given):
-        raise ValueError(f"seeds: one or more integers that are not negative are expected, not {given}")
+        raise ValueError(f"`seeds` must be one or more integers that are not negative, got {given}")
     chosen = [int(one) for one in given]
     opened = open_environment(env, make_options)
     if method == "auto":

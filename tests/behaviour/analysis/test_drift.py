@@ -297,5 +297,5 @@ def test_small_bits_are_ranked_too():
 
 @pytest.mark.parametrize("analysis", [by_position, by_plan, by_group, lambda plans, *_: action_drift(plans)])
 def test_plans_are_expected(analysis):
-    with refuses("plans: Plans are expected"):
+    with refuses("`plans` must be Plans"):
         analysis(torch.zeros(4, 3), torch.zeros(4, 3), torch.ones(4, 3, dtype=torch.bool))

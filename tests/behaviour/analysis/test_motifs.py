@@ -320,5 +320,5 @@ def test_bad_input():
 def test_lengths_are_a_list():
     plans = Plans(torch.arange(60).view(6, 10) % 3, 3)
     assert motifs(plans, lengths=np.array([3])) == motifs(plans, lengths=[3])
-    with refuses("lengths: a list of numbers is expected, not 3"):
+    with refuses("`lengths` must be a list of numbers, got 3"):
         motifs(plans, lengths=3)

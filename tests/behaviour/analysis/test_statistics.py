@@ -240,8 +240,8 @@ def test_differences_that_are_equal_but_for_rounding_have_no_spread(kind: Callab
     [
         (lambda: mean_interval(["a", "b"]), "^values: numbers, shape .G., are expected"),
         (lambda: paired_difference([1, 2], {}), "^second: "),
-        (lambda: holm([0.01], tests=2.5), "^tests: an integer"),  # type: ignore[arg-type]
-        (lambda: holm([0.01], tests="a"), "^tests: an integer"),  # type: ignore[arg-type]
+        (lambda: holm([0.01], tests=2.5), "^`tests` must be an integer"),  # type: ignore[arg-type]
+        (lambda: holm([0.01], tests="a"), "^`tests` must be an integer"),  # type: ignore[arg-type]
     ],
 )
 def test_what_are_no_numbers_is_said(call: Callable[[], object], message: str) -> None:

@@ -144,7 +144,7 @@ def test_effort_without_a_combined_prior_to_fit_is_said(more):
 
 @pytest.mark.parametrize("effort", ["quick", ["fast"]])
 def test_an_unknown_effort_is_said(effort):
-    with refuses("effort", "one of fast, standard, full", f"not {effort!r}"):
+    with refuses("effort", "one of fast, standard, full", f"got {effort!r}"):
         report(chain(), effort=effort)
 
 

@@ -124,8 +124,8 @@ def test_nothing_to_draw():
 @pytest.mark.parametrize(
     ("given", "word"),
     [
-        (["--lengths", "8", "8"], "lengths: each longer than the one before is expected, not 8 8"),
-        (["--lengths", "2", "8"], "lengths: more than 4 is expected first: in grid all plans of 4 are tried"),
+        (["--lengths", "8", "8"], "`lengths` must"),
+        (["--lengths", "2", "8"], "`lengths` must"),
         (["--context", "initial"], "context: grid offers no context of use"),
         (["--kinds", "gru", "gru"], "kinds: each may be given once"),
         (["--num-plans", "100"], "num_plans"),

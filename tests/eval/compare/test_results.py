@@ -58,7 +58,7 @@ def test_rows_hold_means_over_seeds():
 
 def test_unlike_runs_are_refused():
     runs = worlds(["maze"], 2)
-    with pytest.raises(ValueError, match="runs: at least one is expected"):
+    with pytest.raises(ValueError, match="`runs` must have at least one"):
         Results([], ASKED)
     with pytest.raises(ValueError, match="maze, seed 1: uniform is there twice"):
         _ = Results([*runs, run("maze", 1, [entry("uniform", curve(1))])], ASKED).rows

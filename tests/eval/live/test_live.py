@@ -173,7 +173,7 @@ def test_aggregates_over_worlds_are_shares_of_the_oracle():
         (["--worlds", "nowhere"], "nowhere"),
         (["--kinds", "markov", "markov"], "kinds"),
         (["--seeds", "0"], "seeds"),
-        (["--period", "100"], "period: a multiple of 64"),
+        (["--period", "100"], "`period` must be a multiple of 64"),
         (["--length", "6"], "length"),
         (["--items", "20"], "items"),
         (["--agents", "0"], "agents"),

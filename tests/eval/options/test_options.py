@@ -179,8 +179,8 @@ def test_only_priors_with_the_same_context_are_paired():
     ("options", "says"),
     [
         (["--worlds", "taxi"], "worlds"),
-        (["--lengths", "501"], "lengths: integers from 1 to 500"),
-        (["--starts", "127"], "starts: integers from 1 to 126"),
+        (["--lengths", "501"], "`lengths` must be integers from 1 to 500"),
+        (["--starts", "127"], "`starts` must be integers from 1 to 126"),
         (["--modes", "2", "2"], "modes: each may be given once"),
         (["--num-plans", "0"], "num_plans"),
     ],

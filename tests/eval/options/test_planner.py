@@ -141,7 +141,7 @@ def test_beginning_in_a_mode(phases):
 
 
 def test_priors_and_modes_that_do_not_fit():
-    with refuses("prior: a SwitchingPrior is expected, not UniformPrior"):
+    with refuses("`prior` must be a SwitchingPrior, got UniformPrior"):
         OptionPlanner(UniformPrior(3), 4, 8)
     for mode in (3, -1, 0.5):
         with refuses("mode"):

@@ -105,14 +105,14 @@ PLACES = GRID.coordinates(torch.arange(9))
 @pytest.mark.parametrize(
     ("values", "coordinates", "message"),
     [
-        (torch.zeros(9), PLACES, r"values: shape \[K, S\] is expected, not \[9\]"),
-        (torch.zeros(0, 9), PLACES, "values: shape"),
-        (torch.zeros(1, 9, dtype=torch.long), PLACES, "values: floating point is expected, not torch.int64"),
-        (torch.zeros(1, 8), PLACES, r"coordinates: shape \[S, D\] with S = 8 is expected, not \[9, 2\]"),
-        (torch.zeros(1, 9), PLACES[:, 0], "coordinates: shape"),
-        (torch.zeros(1, 9), PLACES[:, :0], "coordinates: shape"),
-        (torch.zeros(1, 9).fill_(float("nan")), PLACES, r"values\[0, 0\]: a finite number is expected, not nan"),
-        (torch.zeros(1, 9), torch.inf * (PLACES + 1.0), r"coordinates\[0, 0\]: a finite number is expected, not inf"),
+        (torch.zeros(9), PLACES, r"`values` must be shape \[K, S\], got \[9\]"),
+        (torch.zeros(0, 9), PLACES, "`values` must be shape"),
+        (torch.zeros(1, 9, dtype=torch.long), PLACES, "`values` must be floating point, got torch.int64"),
+        (torch.zeros(1, 8), PLACES, r"`coordinates` must be shape \[S, D\] with S = 8, got \[9, 2\]"),
+        (torch.zeros(1, 9), PLACES[:, 0], "`coordinates` must be shape"),
+        (torch.zeros(1, 9), PLACES[:, :0], "`coordinates` must be shape"),
+        (torch.zeros(1, 9).fill_(float("nan")), PLACES, r"`values\[0, 0\]` must be a finite number, got nan"),
+        (torch.zeros(1, 9), torch.inf * (PLACES + 1.0), r"`coordinates\[0, 0\]` must be a finite number, got inf"),
     ],
 )
 def test_bad_values_and_coordinates_are_refused(values, coordinates, message):
@@ -124,7 +124,7 @@ def test_bad_values_and_coordinates_are_refused(values, coordinates, message):
 
 @pytest.mark.parametrize(("tile_size", "num_tilings"), [(0, 1), (float("inf"), 1), (1, 0)])
 def test_bad_tiles_are_refused(tile_size, num_tilings):
-    with pytest.raises(ValueError, match=r"^(tile_size|num_tilings): "):
+    with pytest.raises(ValueError, match=r"^`(tile_size|num_tilings)` must be "):
         tile_approximation(torch.zeros(1, 9), PLACES, tile_size, num_tilings)
 
 
@@ -137,5 +137,5 @@ def test_bad_tiles_are_refused(tile_size, num_tilings):
     ],
 )
 def test_bad_networks_are_refused(name, wanted):
-    with pytest.raises(ValueError, match=f"^{name}: {wanted} is expected, not 0"):
+    with pytest.raises(ValueError, match=f"^`{name}` must be {wanted}, got 0"):
         network_approximation(torch.zeros(1, 9), PLACES, **{name: 0})

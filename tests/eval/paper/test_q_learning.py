@@ -124,15 +124,15 @@ def test_progress_is_reported():
         ({"goal": 9}, "`goal` must be a cell from 0 to 8, got 9"),
         ({"goal": -1}, "`goal` must be a cell"),
         ({"goal": 1.5}, "`goal` must be a cell from 0 to 8, got 1.5"),
-        ({"num_agents": 0}, "num_agents: an integer of at least 1 is expected, not 0"),
-        ({"steps": -1}, "steps: "),
-        ({"step_size": 0}, "step_size: "),
-        ({"step_size": 1.5}, "step_size: a number above 0 and at most 1 is expected, not 1.5"),
-        ({"discount": 0}, "discount: "),
-        ({"discount": 1}, "discount: a number above 0 and below 1 is expected, not 1"),
-        ({"initial_scale": -0.1}, "initial_scale: "),
-        ({"initial_scale": float("nan")}, "initial_scale: "),
-        ({"epsilon": 1.1}, "epsilon: a share between 0 and 1 is expected, not 1.1"),
+        ({"num_agents": 0}, "`num_agents` must be an integer of at least 1, got 0"),
+        ({"steps": -1}, "`steps` must be"),
+        ({"step_size": 0}, "`step_size` must be"),
+        ({"step_size": 1.5}, "`step_size` must be a number above 0 and at most 1, got 1.5"),
+        ({"discount": 0}, "`discount` must be"),
+        ({"discount": 1}, "`discount` must be a number above 0 and below 1, got 1"),
+        ({"initial_scale": -0.1}, "`initial_scale` must be"),
+        ({"initial_scale": float("nan")}, "`initial_scale` must be"),
+        ({"epsilon": 1.1}, "`epsilon` must be a share between 0 and 1, got 1.1"),
     ],
 )
 def test_bad_learning_is_refused(arguments, message):
@@ -141,5 +141,5 @@ def test_bad_learning_is_refused(arguments, message):
 
 
 def test_a_goal_alone_is_refused():
-    with pytest.raises(ValueError, match=r"^world: a cell that is not the goal is expected"):
+    with pytest.raises(ValueError, match=r"^`world` must be a cell that is not the goal"):
         q_learning(TabularWorld(torch.tensor([[0, 0]]), torch.zeros(1)), 0)

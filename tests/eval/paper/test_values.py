@@ -149,7 +149,7 @@ def test_can_reach_depends_on_legal_actions_and_the_cell_of_a_state():
         ({"discount": float("nan")}, "`discount` must be"),
         ({"discount": 0.0, "goal": 1}, "`discount` must be at least 0"),
         ({"goal": 9}, "`goal` must be"),
-        ({"sweeps": -1}, "sweeps: "),
+        ({"sweeps": -1}, "`sweeps` must be"),
         ({"tolerance": 0.0}, "`tolerance` must be"),
     ],
 )
@@ -168,11 +168,11 @@ def test_infinite_rewards_are_refused_where_they_count():
 @pytest.mark.parametrize(
     ("state", "goal", "length", "message"),
     [
-        (torch.tensor([9]), 4, 2, "state"),
-        (torch.tensor([0.5]), 4, 2, "state"),
-        (torch.tensor(3), 4, 2, "state"),
+        (torch.tensor([9]), 4, 2, r"state\[0\]: 9 is out of range"),
+        (torch.tensor([0.5]), 4, 2, "`state` must be"),
+        (torch.tensor(3), 4, 2, "`state` must be"),
         (torch.tensor([1]), 9, 2, "`goal`"),
-        (torch.tensor([1]), 4, -1, "length"),
+        (torch.tensor([1]), 4, -1, "`length` must be"),
     ],
 )
 def test_bad_reach_is_refused(state, goal, length, message):

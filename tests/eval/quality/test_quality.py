@@ -127,7 +127,7 @@ def test_text_is_cut_into_parts_that_are_divided():
     assert (len(learned), len(other)) == (20, 10)
     assert len(torch.cat([learned.actions, other.actions]).unique(dim=0)) == 30
     assert sequences(0, seeded(0)) == []
-    with refuses("num_sequences", "not 100000"):
+    with refuses("num_sequences", "got 100000"):
         sequences(100_000, seeded(0))
 
 
@@ -189,7 +189,7 @@ def test_long_sequences_have_a_table_of_their_own(tmp_path, capsys, monkeypatch)
     assert len(fitted) == before  # these were learned
     capsys.readouterr()
     assert main(["quality", "--num-plans", "0", "--num-sequences", "0"]) == 2
-    assert "one of them above 0" in capsys.readouterr().err
+    assert "must be above 0" in capsys.readouterr().err
 
 
 def test_the_price_of_the_combined_prior_is_that_of_its_parts():

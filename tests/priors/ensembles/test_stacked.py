@@ -139,7 +139,7 @@ def test_long_plans_and_a_single_one():
     [
         (Plans(torch.zeros(0, 5, dtype=torch.long), A), "at least two actions"),
         (Plans(torch.zeros(1, 1, dtype=torch.long), A), "at least two actions"),
-        (Plans(torch.zeros(4, 5, dtype=torch.long), 5), "not 5"),
+        (Plans(torch.zeros(4, 5, dtype=torch.long), 5), "got 5"),
     ],
 )
 def test_plans_that_it_cannot_learn_from(plans, word):

@@ -226,7 +226,7 @@ def test_settings_out_of_range_are_refused_and_change_nothing(settings: dict[str
         ),
         (lambda: MarkovPrior(2, 1, num_contexts=200).fit(to_the_middle()), "patterns"),
         (lambda: sample_in_world(LogLinearPrior(2, 3), Line(), torch.tensor([1]), 1, 2), "3 patterns"),
-        (lambda: LogLinearPrior(3, 2).sample(3, 2, PLANS.context[:3, 0]), r"context: .*\[3, 2\]"),  # type: ignore[index]
+        (lambda: LogLinearPrior(3, 2).sample(3, 2, PLANS.context[:3, 0]), r"`context` must"),  # type: ignore[index]
     ],
 )
 def test_bad_input_is_refused(call: Any, message: str) -> None:

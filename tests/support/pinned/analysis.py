@@ -5,7 +5,6 @@ from typing import Any
 
 import torch
 
-from neuroprior import score as score_table
 from neuroprior.behaviour import (
     action_bits,
     action_drift,
@@ -27,6 +26,7 @@ from neuroprior.behaviour import (
     units,
 )
 from neuroprior.priors import ContextTreePrior, MarkovPrior, SwitchingPrior, UniformPrior, forecast, infer
+from neuroprior.priors.scoring import score as score_table
 from neuroprior.worlds import cube, gridworld
 from tests.support.pinned.data import behaviour, timed
 from tests.support.sources import seeded

@@ -125,12 +125,9 @@ def decisions():
                 continue
             state = sure.reset(6, seeded(0))
             found[f"{name}, {goal}"] = make(chain(), **how).plan(sure, state, seeded(1))
-        try:
-            found[f"{name}, stochastic"] = make(chain(), **goals["return"]).plan(
-                unsure, unsure.reset(5, seeded(0)), seeded(1)
-            )
-        except ValueError as error:
-            found[f"{name}, stochastic"] = str(error)
+        if name not in ("frontier", "mcts"):  # which refuse stochastic worlds
+            planner = make(chain(), **goals["return"])
+            found[f"{name}, stochastic"] = planner.plan(unsure, unsure.reset(5, seeded(0)), seeded(1))
     state = sure.reset(6, seeded(0))
     found["best"] = [oracle(sure, state, 4, **how) for how in goals.values()]
     plans = torch.randint(3, (5, 2, 3), generator=seeded(0))
