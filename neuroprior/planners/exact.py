@@ -13,6 +13,9 @@ from neuroprior.planners.planner import check_objective, value_of
 from neuroprior.worlds.tabular import TabularWorld, check_tabular
 from neuroprior.worlds.world import check_plans
 
+OUTCOMES_AT_ONCE = 2**22
+"""Plans times cells times outcomes of an action that are computed together; bounds memory."""
+
 
 def oracle(
     world: TabularWorld,
@@ -82,7 +85,6 @@ def expected_score(
     discount: float = 1.0,
     value: Callable[[Tensor], Tensor] | None = None,
     lengths: Tensor | None = None,
-    outcomes_at_once: int = 2**22,
 ) -> Tensor:
     """The exact expected score of plans that are executed in open loop, whatever their actions lead to.
 
@@ -95,7 +97,6 @@ def expected_score(
         plans: integers `[B, P, L]`; for one plan per start, `plans[:, None]`.
         objective, discount, value: see `Planner`.
         lengths: integers `[B, P]`, 1 to L: how many actions of each plan are executed; None: all.
-        outcomes_at_once: plans times cells times outcomes of an action that are computed together; bounds memory.
 
     Returns:
         `[B, P]` floating point. Takes `B * P * L * S * K` operations.
@@ -123,7 +124,7 @@ def expected_score(
         worth = value_of(value, torch.arange(len(worth), device=world.device))
     table = _Table(world, worth)
     outcomes = 1 if world.probability is None else world.probability.shape[2]
-    size = max(outcomes_at_once // (world.num_states * outcomes), 1)
+    size = max(OUTCOMES_AT_ONCE // (world.num_states * outcomes), 1)
     rows = zip(
         state.repeat_interleave(num_plans).split(size),
         plans.reshape(-1, length).split(size),

@@ -5,6 +5,9 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+BINS = 8
+"""Bins a group at most, in the test of two samples."""
+
 
 def chi_square(counts: Tensor, expected: Tensor) -> float:
     """The p-value of Pearson's test of `counts [K]` against `expected [K]`; the rarest cells are pooled."""
@@ -24,7 +27,7 @@ def chi_square(counts: Tensor, expected: Tensor) -> float:
     return float(torch.special.gammaincc(torch.tensor((len(groups) - 1) / 2).double(), statistic / 2))
 
 
-def alike(first: Tensor, second: Tensor, group: Tensor, num_bins: int = 8) -> float:
+def alike(first: Tensor, second: Tensor, group: Tensor) -> float:
     """The p-value of the chi-square test that two samples of numbers have the same distribution in each group.
 
     Numbers are compared by bins of about equal counts, so that they may be continuous as well as a few distinct ones.
@@ -32,7 +35,6 @@ def alike(first: Tensor, second: Tensor, group: Tensor, num_bins: int = 8) -> fl
     Args:
         first, second: numbers `[N]`; `first[i]` and `second[i]` belong to the group `group[i]`.
         group: int64 `[N]`.
-        num_bins: bins a group at most.
     """
     distinct, value = torch.cat([first, second]).unique(return_inverse=True)
     pairs, which, counts = (group.repeat(2) * len(distinct) + value).unique(return_inverse=True, return_counts=True)
@@ -40,13 +42,13 @@ def alike(first: Tensor, second: Tensor, group: Tensor, num_bins: int = 8) -> fl
     total = torch.zeros(int(group.max()) + 1, dtype=torch.long).index_add(0, owner, counts)
     # The number of smaller values in the same group, and half of the equal ones.
     rank = counts.cumsum(0) - counts / 2 - (total.cumsum(0) - total)[owner]
-    bins = owner * num_bins + (rank * num_bins / total[owner]).long()
-    table = torch.stack([bins[part].bincount(minlength=len(total) * num_bins) for part in which.view(2, -1)]).double()
+    bins = owner * BINS + (rank * BINS / total[owner]).long()
+    table = torch.stack([bins[part].bincount(minlength=len(total) * BINS) for part in which.view(2, -1)]).double()
     both = table.sum(0)
     rare = both < 10
     free = int((~rare).sum())
     # Both samples have equally many numbers in a group, which takes one degree of freedom.
-    free -= int((((both == 0) | ~rare).view(-1, num_bins).all(1) & (both.view(-1, num_bins).sum(1) > 0)).sum())
+    free -= int((((both == 0) | ~rare).view(-1, BINS).all(1) & (both.view(-1, BINS).sum(1) > 0)).sum())
     if free < 1:
         return 1.0
     statistic = ((table[0] - table[1]) ** 2 / both)[~rare].sum()

@@ -13,7 +13,7 @@ from neuroprior import (
     collect,
     oracle,
 )
-from neuroprior.planners import expected_score
+from neuroprior.planners import exact, expected_score
 from neuroprior.planners.rollouts import mean_scores
 from neuroprior.sampling import sample_in_world
 from tests.support.sources import (
@@ -77,7 +77,9 @@ def test_expected_scores_are_those_of_all_trajectories(kind, goal):
             plan = plans[b, p].tolist()
             assert float(whole[b, p]) == pytest.approx(brute_force(world, b, plan, goal), abs=1e-5)
             assert float(cut[b, p]) == pytest.approx(brute_force(world, b, plan[: int(lengths[b, p])], goal), abs=1e-5)
-    assert torch.equal(expected_score(world, states, plans, outcomes_at_once=60, **goal), whole)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(exact, "OUTCOMES_AT_ONCE", 60)
+        assert torch.equal(expected_score(world, states, plans, **goal), whole)
 
 
 @pytest.mark.parametrize("goal", OBJECTIVES)

@@ -115,8 +115,6 @@ def count_histories(
     device: torch.device,
     *,
     max_bytes: int = MAX_TABLE_BYTES,
-    at_once: int = ACTIONS_AT_ONCE,
-    by_ngrams: bool | None = None,
 ) -> tuple[Tree, Counts]:
     """The histories of up to `depth` actions in `plans`, and what followed them.
 
@@ -129,20 +127,16 @@ def count_histories(
         openings: False leaves openings out, and the tree starts in the empty history.
         device: where to count.
         max_bytes: the most memory that the tables may take.
-        at_once: actions that are counted together.
-        by_ngrams: count the n-grams of `depth` + 1 actions in a table first, and each that occurs once; only for plans
-            of one length, counted without context. None: where there are few enough.
 
     Raises:
         TooLargeError: the tables would be larger than `max_bytes`.
     """
     histories = _Histories(plans.num_actions, depth, num_contexts or 1, device, max_bytes)
-    size = max(at_once // max(plans.max_length, 1), 1)
-    if by_ngrams is None:
-        number = plans.num_actions ** (depth + 1)
-        few = 0 < depth < plans.max_length and number <= min(MOST_NGRAMS, plans.actions.numel() // 4)
-        by_ngrams = few and num_contexts is None and plans.lengths is None
-    if by_ngrams:
+    size = max(ACTIONS_AT_ONCE // max(plans.max_length, 1), 1)
+    number = plans.num_actions ** (depth + 1)
+    few = 0 < depth < plans.max_length and number <= min(MOST_NGRAMS, plans.actions.numel() // 4)
+    if few and num_contexts is None and plans.lengths is None:
+        # A table of n-grams is small: each that occurs is then counted once.
         histories.add(*_ngrams(plans.actions[:, :depth], depth, plans.num_actions, size, device))
         histories.add(*_ngrams(plans.actions, depth + 1, plans.num_actions, size, device), begins=False)
         return histories.finish(openings)

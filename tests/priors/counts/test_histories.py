@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import ContextTreePrior, MarkovPrior, Plans
+from neuroprior.priors.counts import histories
 from neuroprior.priors.counts.histories import count_histories
 from tests.support.sources import refuses, seeded
 
@@ -62,7 +63,9 @@ def names(tree, depth):
 @given(problems(), st.sampled_from([1, 7, 2**18]))
 def test_the_tree_and_its_counts(problem, at_once):
     plans, contexts, depth = problem
-    tree, counts = count_histories(plans, depth, contexts, True, torch.device("cpu"), at_once=at_once)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(histories, "ACTIONS_AT_ONCE", at_once)
+        tree, counts = count_histories(plans, depth, contexts, True, torch.device("cpu"))
     truth = dictionary(plans, contexts, depth)
     name = names(tree, depth)
     assert len(name) == len(tree.parent) == len(tree.next_node)
@@ -80,7 +83,7 @@ def test_the_tree_and_its_counts(problem, at_once):
 @pytest.mark.parametrize(
     "make", [lambda: MarkovPrior(3, 4, num_contexts=2), lambda: ContextTreePrior(3, 6, num_contexts=2)]
 )
-def test_read_in_parts(make):
+def test_read_in_parts(make, monkeypatch):
     """Parts of any size give the same prior, but for the numbering of its histories."""
     generator = seeded(0)
     lengths = torch.randint(10, (300,), generator=generator)
@@ -88,7 +91,8 @@ def test_read_in_parts(make):
     test, current = torch.randint(3, (50, 12), generator=generator), torch.randint(2, (50, 12), generator=generator)
     want, prior = make().fit(plans)(test, current), make()
     depth = getattr(prior, "depth", 4)
-    prior.learn(*count_histories(plans, depth, 2, True, prior.device, at_once=50))
+    monkeypatch.setattr(histories, "ACTIONS_AT_ONCE", 50)
+    prior.learn(*count_histories(plans, depth, 2, True, prior.device))
     torch.testing.assert_close(prior(test, current), want)
 
 
@@ -114,24 +118,24 @@ def test_rows_of_contexts_over_the_limit_are_refused(monkeypatch):
 @pytest.mark.parametrize(
     ("num_actions", "depth", "length"), [(1, 1, 3), (2, 1, 2), (2, 3, 4), (3, 2, 9), (4, 2, 30), (5, 1, 3)]
 )
-def test_counted_by_ngrams_or_not_the_prior_is_the_same(num_actions, depth, length, initial):
+def test_counted_by_ngrams_or_not_the_prior_is_the_same(num_actions, depth, length, initial, monkeypatch):
     actions = torch.randint(num_actions, (2000, length), generator=seeded(0)).square() % num_actions
     plans = Plans(actions.to(torch.uint8), num_actions)
     test = torch.randint(num_actions, (50, length + 3), generator=seeded(1))
     want = MarkovPrior(num_actions, depth, initial=initial).fit(plans)(test)
-    for by_ngrams in (True, False):
-        prior = MarkovPrior(num_actions, depth, initial=initial)
-        counted = count_histories(plans, depth, None, prior.openings, prior.device, by_ngrams=by_ngrams)
-        prior.learn(*counted)
-        torch.testing.assert_close(prior(test), want)
+    monkeypatch.setattr(histories, "MOST_NGRAMS", 0)
+    prior = MarkovPrior(num_actions, depth, initial=initial)
+    prior.learn(*count_histories(plans, depth, None, prior.openings, prior.device))
+    torch.testing.assert_close(prior(test), want)
     assert torch.equal(plans.actions, actions.to(torch.uint8))
 
 
-def test_ngrams_are_counted_whole():
+def test_ngrams_are_counted_whole(monkeypatch):
     """Read some plans at a time, every sequence is counted as often as it occurs, and the plans stay as they are."""
     plans = Plans(torch.randint(4, (200, 30), dtype=torch.uint8, generator=seeded(0)), 4)
     kept = plans.actions.clone()
-    tree, counts = count_histories(plans, 2, None, True, torch.device("cpu"), at_once=7 * 30, by_ngrams=True)
+    monkeypatch.setattr(histories, "ACTIONS_AT_ONCE", 7 * 30)
+    tree, counts = count_histories(plans, 2, None, True, torch.device("cpu"))
     name = names(tree, 2)
     found = Counter()
     for row, action, count in zip(counts.row.tolist(), counts.action.tolist(), counts.count.tolist(), strict=True):
@@ -141,10 +145,11 @@ def test_ngrams_are_counted_whole():
 
 
 @pytest.mark.parametrize(("num_plans", "depth"), [(200, 30), (200, 0), (2, 2), (10, 8)])
-def test_ngrams_only_where_they_are_few(num_plans, depth):
+def test_ngrams_only_where_they_are_few(num_plans, depth, monkeypatch):
     """Depths as long as the plans, of no action, or with too many possible sequences are counted otherwise."""
     plans = Plans(torch.randint(4, (num_plans, 30), generator=seeded(0)), 4)
     found = count_histories(plans, depth, None, True, torch.device("cpu"))
-    want = count_histories(plans, depth, None, True, torch.device("cpu"), by_ngrams=False)
+    monkeypatch.setattr(histories, "MOST_NGRAMS", 0)
+    want = count_histories(plans, depth, None, True, torch.device("cpu"))
     assert all(a.equal(b) for a, b in zip(found[0][:2], want[0][:2], strict=True))
     assert all(getattr(found[1], name).equal(getattr(want[1], name)) for name in ("row_code", "row", "action", "count"))
