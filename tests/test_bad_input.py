@@ -133,7 +133,6 @@ PLANS = Plans(torch.tensor([[0, 1, 1], [1, 0, 1]]), 2)
         (lambda: folds(None, 2), ["plans", "NoneType"]),
         (lambda: analysis.transitions(ACTIONS), ["plans", "Tensor"]),
         (lambda: analysis.motifs([[0, 1]]), ["plans", "list"]),
-        (lambda: analysis.two_sample_tests(PLANS, None), ["plans", "NoneType"]),
         (lambda: analysis.score("x", None, PLANS), ["prior", "NoneType"]),
         (lambda: analysis.score_bits("x", "actions", torch.zeros(2, 2), PLANS), ["bits", "[2, 3]", "[2, 2]"]),
         (lambda: analysis.score_bits("x", "actions", torch.full((2, 3), torch.nan), PLANS), ["bits", "NaN"]),

@@ -33,7 +33,6 @@ from neuroprior.behaviour import (
     mean_intervals,
     motifs,
     mutual_information,
-    order_selection,
     paired_difference,
     probability_of_improvement,
     ratio_difference,
@@ -113,7 +112,6 @@ LEVELS = [
 ORDERS = {
     "order": [partial(MarkovPrior, 3), partial(SwitchingPrior, 3, 2)],
     "depth": [partial(ContextTreePrior, 3)],
-    "max_order": [partial(order_selection, PLANS)],
     "skip": [partial(mutual_information, PLANS, 2)],
     "first": [PLANS.steps, VECTORS.steps],
     "stop": [partial(VECTORS.steps, 1)],

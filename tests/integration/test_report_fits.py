@@ -101,24 +101,6 @@ def test_two_actions_back_and_no_further(second_order):
             assert -0.1 < row["bits"] < 0.01
     informed = {row["lag"]: row for row in results["lags"] if row["what"] == "mutual information"}
     assert all(informed[lag]["low"] > informed[lag]["critical_value"] for lag in (1, 2))
-    orders = {row["order"]: row["bic"] for row in results["orders"]}
-    assert min(orders, key=orders.__getitem__) == 2
-
-
-def test_plans_of_the_right_order_do_not_differ(second_order):
-    """Those of a GRU that was hardly trained can: by each of 999 permutations. Distances vary by a few percent only."""
-    results, _ = second_order
-    rows = results["likeness"]
-    models = {row["model"] for row in rows}
-    (chain,) = (model for model in models if model.startswith("markov"))
-    assert int(chain.removeprefix("markov-")) >= 2
-    for row in rows:
-        if row["model"] == chain:
-            assert row["distance"] < 1.5 * row["null_distance"] + 0.01, row
-            assert row["corrected"] > 0.006, row  # that of 1 in 1000 permutations, six statistics
-    untrained = [row for row in rows if row["model"] == "gru"]
-    assert min(row["corrected"] for row in untrained) == pytest.approx(0.006)
-    assert any(row["distance"] > 3 * row["null_distance"] for row in untrained)
 
 
 def test_a_planted_difference_of_groups_is_found(tmp_path):
@@ -189,7 +171,7 @@ def test_test_files_of_another_kind(learned, test, words, tmp_path, capsys):
 
 
 INTERRUPTED = ("--models", "counts", "--max-steps", "3", "--folds", "6")
-WRITTEN = ("results.json", "plans.csv", "lags.csv", "likeness.csv")
+WRITTEN = ("results.json", "plans.csv", "lags.csv", "drift.csv")
 
 
 @pytest.fixture(scope="module")

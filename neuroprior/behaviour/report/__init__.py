@@ -8,9 +8,7 @@ Needs pandas, matplotlib, jinja2, joblib and rich (`pip install 'neuroprior[repo
 
 from neuroprior.behaviour.report.document import Document, publish, table
 from neuroprior.behaviour.report.figures import (
-    calibration_figure,
     condition_figure,
-    distribution_figure,
     drift_figure,
     dwell_figure,
     ethogram_figure,
@@ -18,8 +16,6 @@ from neuroprior.behaviour.report.figures import (
     lag_figure,
     motif_figure,
     occupancy_figure,
-    order_figure,
-    raster_figure,
     score_figure,
     transition_figure,
 )
@@ -31,9 +27,7 @@ __all__ = [
     "FigureBox",
     "Section",
     "Table",
-    "calibration_figure",
     "condition_figure",
-    "distribution_figure",
     "drift_figure",
     "dwell_figure",
     "ethogram_figure",
@@ -41,9 +35,7 @@ __all__ = [
     "lag_figure",
     "motif_figure",
     "occupancy_figure",
-    "order_figure",
     "publish",
-    "raster_figure",
     "report",
     "score_figure",
     "table",

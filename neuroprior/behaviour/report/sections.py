@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from math import log
 from typing import Any
 
 import pandas as pd
@@ -13,26 +12,22 @@ from neuroprior.behaviour.analysis.comparison import never_taken, too_few, unit_
 from neuroprior.behaviour.analysis.drift import action_drift, by_group, by_plan, by_position
 from neuroprior.behaviour.analysis.lags import mutual_information
 from neuroprior.behaviour.analysis.motifs import motifs
-from neuroprior.behaviour.analysis.orders import order_selection
 from neuroprior.behaviour.analysis.statistics import ENOUGH_UNITS
 from neuroprior.behaviour.analysis.transitions import transitions
-from neuroprior.behaviour.analysis.two_sample import two_sample_tests
 from neuroprior.behaviour.report import figures
 from neuroprior.behaviour.report.conditions import condition_section
 from neuroprior.behaviour.report.document import Column, table
 from neuroprior.behaviour.report.durations import duration_section
-from neuroprior.behaviour.report.fits import ACTIONS, CONTEXT
+from neuroprior.behaviour.report.fits import ACTIONS
 from neuroprior.behaviour.report.modes import mode_section
 from neuroprior.behaviour.report.page import FigureBox, Section, Table
 from neuroprior.behaviour.report.part import LISTED, SIGNIFICANT, Part, action_names, group_names, p_text
-from neuroprior.behaviour.report.scores import Evaluation, Model
+from neuroprior.behaviour.report.scores import Evaluation
 from neuroprior.plans import Plans, constant_context, has_patterns
 from neuroprior.plans.columns import never_occur
-from neuroprior.priors import learn_macros
 
-MOST_ORDER, MOST_LAG, MOST_MACROS = 6, 20, 16
+MOST_LAG = 20
 LISTED_LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 20)
-DRAWN = 12  # sequences, real and generated
 MANY_REPEATS = 0.2  # of all actions: beyond, over-represented sequences are also sought with repeats merged
 BEGINNING = 5  # actions of a plan that do not count in drift
 LEAST = 1e-9  # bits: below, a gain is 0 but for rounding
@@ -173,7 +168,9 @@ def lag_section(found: Evaluation) -> Part | None:
     wide = lags.assign(cell=cells, curve=names).pivot(index="lag", columns="curve", values="cell")[names.unique()]
     wide = wide[wide.index.isin(LISTED_LAGS)].reset_index()
     columns = {name.replace(", ", "\n").replace("with context", "+ context"): name for name in wide.columns}
-    over = f"{unit_name(found.plans)} (gain: {unit_name(found.sampled)} of the first fold, if there are {ENOUGH_UNITS})"
+    over = (
+        f"{unit_name(found.plans)} (gain: {unit_name(found.first_fold)} of the first fold, if there are {ENOUGH_UNITS})"
+    )
     text = [
         "Mutual information: of two actions k steps apart, whatever lies between. Gain: how much the action k steps"
         " back improves predictions beyond all nearer ones, in held-out plans of the first fold: a model that knows k"
@@ -190,64 +187,6 @@ def lag_section(found: Evaluation) -> Part | None:
     box = FigureBox(figures.lag_figure(lags), caption, "Information by lag.", "lags")
     shown = table(wide, columns, "Bits." if few else f"Bits. *: above 0, by the 95 % interval of that lag over {over}.")
     return Part(Section("Information by lag", text, [shown], [box]), {"lags": lags})
-
-
-def order_section(found: Evaluation) -> Part | None:
-    """Which order a Markov chain needs."""
-    plans = found.plans
-    lengths = plans.mask().sum(1)
-    if int(lengths.max()) < 2 or plans.num_actions < 2:
-        return None
-    # All orders are fitted on the same actions: those with as many before them as the highest order takes.
-    most = min(MOST_ORDER, max(int(lengths.double().median()) // 2, 1), int(lengths.max()) - 1)
-    number = _num_contexts(plans)
-    fitted = {ACTIONS: order_selection(plans, most)}
-    if number is not None:
-        fitted[CONTEXT] = order_selection(plans, most, number)
-    orders = pd.concat([pd.DataFrame(own).assign(context=inputs) for inputs, own in fitted.items()], ignore_index=True)
-    orders = orders[["context", *orders.columns.drop("context")]]
-    scale = 2 * log(2) * orders["num_actions_scored"].clip(lower=1)
-    orders = orders.assign(bic_bits=orders["bic"] / scale, aic_bits=orders["aic"] / scale)
-    scores = found.table()
-    held_out = figures.chain_scores(scores)[["order", "context", "bits_per_action"]]
-    both = orders.merge(held_out, how="left", on=["order", "context"])
-    criteria = {"BIC": "bic_bits", "AIC": "aic_bits", "held out": "bits_per_action"}
-    columns: dict[str, Column] = {"order": "order", "input": _input, "parameters": "num_parameters:,"}
-    for heading, name in criteria.items():
-        least = (both[name] == both.groupby("context")[name].transform("min")) & (not found.too_few)
-        marked = both[name].map("{:.4f}".format) + least.map({True: "*", False: " "})
-        both[heading] = marked.where(both[name].notna())
-        columns[heading] = heading
-    star = "" if found.too_few else ", the least of each input with a star"
-    caption = f"Bits per action{star}; the information criteria are halved, so that they stand on the same scale."
-    text = [
-        "The information criteria judge plans that were learned from, and count a parameter for each action after each"
-        " history that occurred. Held-out chains back off to shorter histories where a history is rare."
-    ]
-    text += [_no_verdict(found.too_few)] if found.too_few else []
-    shown = table(both, columns, caption, align="llrrrr")
-    figure = figures.order_figure(orders, scores, not found.too_few)
-    caption = "" if found.too_few else "The least of each curve is ringed."
-    box = FigureBox(figure, caption or "Bits per action by order.", "Order selection.", "orders")
-    return Part(Section("Markov order", text, [shown], [box]), {"orders": orders})
-
-
-def calibration_section(found: Evaluation) -> Part | None:
-    """Whether forecast probabilities are the shares of actions taken."""
-    models = found.leading(found.best.inputs) or found.models
-    known = [(model, model.calibration) for model in models if model.calibration is not None]
-    rows = [(own.name, own.inputs, one.forecast, *one.taken, one.number) for own, sums in known for one in sums.bins]
-    if not rows:
-        return None
-    names = ["model", "context", "forecast", "taken", "low", "high", "number"]
-    calibration = pd.DataFrame(rows, columns=names)
-    errors = [{"model": own.label, "error": 100 * sums.expected_calibration_error} for own, sums in known]
-    columns = {"model": "model", "expected calibration error, %": "error:.2f"}
-    shown = table(pd.DataFrame(errors), columns, "Mean distance of forecast probability and share taken.")
-    text = ["Of the actions with a forecast probability of about 0.3, were 0.3 taken? Points on the diagonal: yes."]
-    caption = f"Forecast probability against the share taken; 95 % intervals over {found.unit}."
-    box = FigureBox(figures.calibration_figure(calibration), caption, "Calibration of the models.", "calibration")
-    return Part(Section("Calibration", text, [shown], [box]), {"calibration": calibration})
 
 
 def transition_section(found: Evaluation) -> Part | None:
@@ -335,107 +274,6 @@ def motif_section(found: Evaluation) -> Part | None:
         *([_no_verdict(few)] if few else []),
     ]
     return Part(Section("Over-represented sequences", text, tables, boxes), {"motifs": frame})
-
-
-def macro_section(found: Evaluation) -> Part | None:
-    """Sequences that could be taken as one action; None where none makes the code of the plans shorter."""
-    plans, names = found.plans, action_names(found.plans)
-    macros, _ = learn_macros(plans, MOST_MACROS, "compression")
-    if not macros:
-        return None
-    spelled = [" ".join(names[action] for action in macro.actions) for macro in macros]
-    counts = plans.actions[plans.mask()].long().bincount().double()
-    before = float(-torch.special.xlogy(counts, counts / counts.sum()).sum()) / log(2)
-    rows = [(name, len(one.actions), one.count, one.gain) for name, one in zip(spelled, macros, strict=True)]
-    frame = pd.DataFrame(rows, columns=["macro", "actions", "count", "gain_bits"])
-    frame["bits_per_action"] = (before - frame["gain_bits"].cumsum()) / float(counts.sum())
-    text = [
-        "Sequences that could be taken as one action. Repeatedly, the two successive actions (or macro-actions) are"
-        " joined that shorten the code of the plans most, in which each is coded by its frequency, and which includes"
-        " what macro-actions stand for. Earlier ones may be parts of later ones."
-    ]
-    none = pd.DataFrame([{"macro": "none", "bits_per_action": before / float(counts.sum())}])
-    shown = pd.concat([none, frame]).astype({"count": "Int64"})
-    columns = {"macro-action": "macro", "count": "count:,", "gain": "gain_bits:,.0f"}
-    columns |= {"bits per action": "bits_per_action:.3f"}
-    caption = (
-        "In the order in which they were found. count: how often each was put in then; gain: bits saved then; bits per"
-        " action: of the code with all macro-actions up to that one."
-    )
-    return Part(Section("Macro-actions", text, [table(shown, columns, caption)]), {"macros": frame})
-
-
-def likeness_section(found: Evaluation) -> Part | None:
-    """Sequences sampled from the models beside real ones."""
-    # Where plans come in groups there is no test: plans of one subject are more alike than those of a model of all
-    # subjects, however good, and the first fold holds too few groups to shuffle these.
-    cut = bool(found.settings.get("cut"))
-    few = too_few(found.sampled, cut=cut)
-    tested = found.scored.group is None and not few
-    rows: list[dict[str, Any]] = []
-    shown: tuple[Model, Plans, list[Any]] | None = None
-    for model in sorted(found.leading(CONTEXT) + found.leading(ACTIONS), key=lambda model: model.cost):
-        if model.generated is None:
-            continue
-        real = found.sampled[: len(model.generated)]
-        real = Plans(real.actions, real.num_actions, real.lengths)
-        results = two_sample_tests(real, Plans(model.generated, real.num_actions, real.lengths), generator=_shuffles())
-        if results and shown is None:
-            shown = model, real, results
-        rows += [
-            {"model": model.name, "context": model.inputs, "statistic": one.statistic}
-            | {"distance": one.distance, "null_distance": one.null_distance}
-            | {"p_value": one.p_value if tested else None, "corrected": one.corrected if tested else None}
-            for one in results
-        ]
-    if shown is None:
-        return None
-    best, real, results = shown
-    frame = pd.DataFrame(rows)
-    stars = (frame["corrected"] < SIGNIFICANT).map({True: "*", False: ""})
-    cells = frame.assign(cell=frame["distance"].map("{:.3f}".format) + stars)
-    statistics = [one.statistic for one in results]
-    order = frame[["model", "context"]].drop_duplicates()
-    wide = cells.pivot(index=["model", "context"], columns="statistic", values="cell").reset_index()
-    wide = order.merge(wide, on=["model", "context"])
-    wide.loc[len(wide)] = {"model": "same source", "context": ""} | {
-        one.statistic: f"{one.null_distance:.3f}" for one in results
-    }
-    test = "*: p < 0.05, permutation test over plans, corrected."
-    if not tested:
-        grouped = found.scored.group is not None
-        test = "Not tested: plans of one group are not independent." if grouped else f"Not tested: {few}."
-    caption = (
-        f"Total variation between the distributions in generated and in held-out real plans (0: the same). {test}"
-        " same source: the distance of two such sets from one source, were all plans independent."
-    )
-    columns: dict[str, Column] = {
-        "model": "model",
-        "input": _input,
-        **{name.replace(" ", "\n"): name for name in statistics},
-    }
-    text = [
-        "From each model of the first fold a plan was sampled for each held-out plan, as long as that. Generated and"
-        " real plans are compared by sequences of actions (n-grams), by how long an action is repeated, and by how"
-        " long it takes to return. The figures show the model with the fewest bits."
-    ]
-    assert best.generated is not None
-    beyond = ~real[:DRAWN].mask()
-    above, below = (some[:DRAWN].long().masked_fill(beyond, -1) for some in (real.actions, best.generated))
-    caption_of_figure = f"Held-out plans, and plans sampled from {best.label}."
-    figure = figures.raster_figure(above, below, action_names(found.plans))
-    boxes = [FigureBox(figure, caption_of_figure, "Real and generated sequences as strips of colour.", "raster")]
-    lengths = {
-        f"{one.statistic}, actions": (one.real.tolist(), one.generated.tolist())
-        for one in results
-        if len(one.classes[0]) == 1 and "gram" not in one.statistic
-    }
-    if lengths:
-        caption_of_figure = "Shares of run lengths and return times; the last class holds all that are longer."
-        alt = "Run lengths and return times, real and generated."
-        boxes.append(FigureBox(figures.distribution_figure(lengths), caption_of_figure, alt, "distributions"))
-    shown_table = table(wide, columns, caption, align="ll" + "r" * len(statistics))
-    return Part(Section("Generated sequences", text, [shown_table], boxes), {"likeness": frame})
 
 
 def drift_section(found: Evaluation) -> Part | None:
@@ -535,14 +373,10 @@ SECTIONS: dict[str, Callable[[Evaluation], Part | None]] = {
     "scores": score_section,
     "conditions": condition_section,
     "lags": lag_section,
-    "orders": order_section,
-    "calibration": calibration_section,
     "transitions": transition_section,
     "motifs": motif_section,
-    "macros": macro_section,
     "durations": duration_section,
     "modes": mode_section,
-    "likeness": likeness_section,
     "drift": drift_section,
 }
 """By name, in the order of the page."""

@@ -148,27 +148,6 @@ def test_features_are_for_neural_models_alone(kind, tmp_path):
     torch.testing.assert_close(found.models[-1].bits, want)
 
 
-def test_calibration_and_samples_are_of_the_held_out_plans(tmp_path):
-    """The forecasts of all folds are counted once, and samples stand in the place of the first fold's plans."""
-    plans = chain()
-    found = evaluated(plans, tmp_path, skip=1)
-    first = split(plans, None, Design(2), 0)[1]
-    assert found.sampled.actions.equal(plans[first].actions)
-    for model in found.models:
-        sums = model.calibration.sums.sum((0, 1))
-        number = int(found.mask.sum())
-        assert sums.tolist() == pytest.approx([number, number, 3 * number], rel=1e-5)
-        assert model.generated.shape == (len(first), 7)
-        assert model.generated.max() < 3
-    *chains, tree = found.models[1:]
-    best = min(chains, key=lambda model: model.cost)
-    assert best != chains[0]
-    assert found.leading(ACTIONS) == [best, tree]
-    (one,) = found.models[0].calibration.bins
-    assert one.forecast == pytest.approx(1 / 3, abs=1e-6)
-    assert one.taken.mean == pytest.approx(1 / 3)
-
-
 def test_the_combined_prior_learns_its_weights_on_plans_that_its_experts_did_not_see(monkeypatch):
     """Actions are independent; a chain of order 6 knows by heart the plans that it counted, and no others."""
 
@@ -191,41 +170,6 @@ def test_durations_of_other_held_out_plans_do_not_matter():
     bits, again = (fits.fit_and_score(plans, some, design, job)["gru/bits"] for some in (test, other))
     assert again[:3] == pytest.approx(bits[:3], abs=1e-6)
     assert abs(again[3:] - bits[3:]).max() > 1e-4
-
-
-@pytest.mark.parametrize("at_once", [1, 14, 25])
-def test_plans_are_scored_in_parts_as_a_whole(at_once, monkeypatch):
-    """Bits and forecasts of all parts count, also where a part has no action that counts."""
-    plans = chain()
-    prior, mask = MarkovPrior(3, 1).fit(plans), counted(plans, 2)
-    unit = units(plans, mask)
-    whole = fits.score_arrays(prior, plans, mask, unit)
-    assert whole["calibration"][..., 2].sum() == 3 * int(mask.sum())
-    monkeypatch.setattr(MarkovPrior, "actions_at_once", at_once)
-    assert not mask.any(1).all()
-    parts = fits.score_arrays(prior, plans, mask, unit)
-    for what, values in whole.items():
-        assert parts[what].reshape(-1).tolist() == pytest.approx(values.reshape(-1).tolist(), abs=1e-6)
-
-
-def test_samples_in_contexts_that_follow_from_actions(tmp_path):
-    """In a ring of four places; what is written beyond the ends of plans says nothing of where actions lead."""
-    actions = torch.randint(3, (24, 7), generator=seeded(0))
-    place = torch.arange(24)[:, None] % 4 + torch.nn.functional.pad((actions - 1).cumsum(1), (1, 0))[:, :-1]
-    plans = chain(context=place % 4)
-    plans = replace(plans, actions=actions, context=plans.context.where(plans.mask(), 3))
-    found = evaluated(plans, tmp_path, inputs=(CONTEXT,))
-    assert all(model.generated.shape == (12, 7) for model in found.models)
-    # Where a context leads to two others by the same action, samples have none.
-    other = replace(plans, context=context_of("index a step"))
-    assert all(model.generated is None for model in evaluated(other, tmp_path, inputs=(CONTEXT,)).models)
-
-
-def test_samples_in_a_context_that_is_only_seen_last():
-    """Where it leads is unknown; all actions may be taken in it. Twelve are equal by chance with 6e-6."""
-    plans = Plans(torch.randint(3, (24, 4), generator=seeded(0)), 3, context=torch.arange(4).repeat(24, 1))
-    found = fits.fit_and_score(plans, plans[:12], Design(1), Job(0, "counts", CONTEXT))
-    assert len(set(found["markov-0/generated"][:, -1])) > 1
 
 
 @pytest.mark.parametrize("skip", [0, 2])

@@ -7,17 +7,15 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 
 from neuroprior import Plans
-from neuroprior.behaviour.report.drawing import KINDS, MARKOV, SPARE, colors, lines
+from neuroprior.behaviour.report.drawing import KINDS, MARKOV, SPARE, colors
 from neuroprior.behaviour.report.figures import (
     STRIPS,
-    calibration_figure,
     condition_figure,
     drift_figure,
     dwell_figure,
     ethogram_figure,
     lag_figure,
     motif_figure,
-    order_figure,
     score_figure,
 )
 
@@ -39,25 +37,6 @@ def test_dwell_times():
         (law,) = axes.lines
         assert law.get_xydata().tolist() == [[2.0, 0.4], [6.0, 0.3]]
         assert (axes.get_xscale(), axes.get_xlim()) == ("log", (1.0, 9.0))
-
-
-def test_calibration():
-    """A panel a model; a dot at forecast and share, its area by the number, and the interval upright through it."""
-    bins = [("gru", "actions", 0.1, 0.2, 0.05, 0.3, 100), ("gru", "actions", 0.8, 0.7, 0.6, 0.9, 25)]
-    bins.append(("gru", "actions and context", 0.5, 0.4, 0.3, 0.6, 7))
-    columns = ["model", "context", "forecast", "taken", "low", "high", "number"]
-    figure = calibration_figure(pd.DataFrame(bins, columns=columns))
-    assert [title(axes) for axes in figure.axes] == ["gru", "gru, with context"]
-    bars, dots = figure.axes[0].collections
-    assert [segment.tolist() for segment in bars.get_segments()] == [
-        [[0.1, 0.05], [0.1, 0.3]],
-        [[0.8, 0.6], [0.8, 0.9]],
-    ]
-    assert dots.get_offsets().tolist() == [[0.1, 0.2], [0.8, 0.7]]
-    assert dots.get_sizes().tolist() == pytest.approx([8 + 70, 8 + 35])
-    assert figure.axes[1].collections[1].get_offsets().tolist() == [[0.5, 0.4]]
-    assert figure.axes[0].lines[0].get_xydata().tolist() == [[0, 0], [1, 1]]
-    assert (figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()) == ("forecast probability", "share taken")
 
 
 @pytest.mark.parametrize("paired", [False, True])
@@ -104,43 +83,12 @@ def test_motifs_have_their_counts():
         assert (dots[at], spans[at], counts[at]) == (ratio, [low, high], f"{count:,}")
 
 
-def test_orders_that_are_left_out():
-    """A chain that was too large has no row: what is drawn, and ringed, stands at the order, not at the row."""
-    orders = pd.DataFrame({"order": [1, 2, 4], "context": "actions", "bic_bits": [2.0, 1.8, 1.5]})
-    orders["aic_bits"] = [1.9, 1.6, 1.7]
-    held_out = [("markov-4", 1.4, 1.3, 1.5), ("uniform", 3.0, 3.0, 3.0), ("markov-2", 1.7, 1.6, 1.8)]
-    scores = pd.DataFrame(held_out, columns=["model", "bits_per_action", "low", "high"]).assign(context="actions")
-    axes = order_figure(orders, scores).axes[0]
-    curves = {line.get_label(): line for line in axes.lines if line.get_markersize() != 13}
-    assert {name: line.get_xydata().tolist() for name, line in curves.items()} == {
-        "BIC": [[1, 2.0], [2, 1.8], [4, 1.5]],
-        "AIC": [[1, 1.9], [2, 1.6], [4, 1.7]],
-        "held out, actions": [[2, 1.7], [4, 1.4]],
-    }
-    rings = [line for line in axes.lines if line.get_markersize() == 13]
-    assert [line.get_xydata().tolist() for line in rings] == [[[4, 1.5]], [[2, 1.6]], [[4, 1.4]]]
-    assert [line.get_markeredgecolor() for line in rings] == [line.get_color() for line in curves.values()]
-    assert curves["held out, actions"].get_color() == next(iter(lines(["held out, actions"])))[0]
-    ends = axes.collections[-1].get_paths()[0].vertices
-    assert {tuple(end) for end in ends.tolist()} == {(2, 1.6), (2, 1.8), (4, 1.3), (4, 1.5)}
-    assert not [
-        line for line in order_figure(orders, scores, ringed=False).axes[0].lines if line.get_markersize() == 13
-    ]
-
-
 @pytest.mark.parametrize(
     ("make", "frames", "words"),
     [
         (score_figure, ["model context low high"], "scores: .*; bits_per_action missing"),
         (lag_figure, ["model lag bits low high critical_value"], "lags: .*; what, context missing"),
-        (
-            order_figure,
-            ["order", "model context bits_per_action low high"],
-            "orders: .*; context, bic_bits, aic_bits m",
-        ),
-        (order_figure, ["order context bic_bits aic_bits", "model"], "scores: .*; context, bits_per_action"),
         (dwell_figure, ["action"], "dwell: .*; number, zero"),
-        (calibration_figure, ["model context"], "calibration: .*; forecast"),
         (condition_figure, ["feature", "feature"], "means: .*; condition"),
         (condition_figure, ["feature condition mean low high", "feature"], "values: .*; unit, condition, value m"),
         (motif_figure, ["sequence"], "motifs: .*; ratio, low, high, count missing"),

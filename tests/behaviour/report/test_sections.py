@@ -19,12 +19,10 @@ from neuroprior.behaviour.report.sections import (
     action_frame,
     drift_section,
     lag_section,
-    macro_section,
     motif_section,
-    order_section,
 )
 from neuroprior.plans import Plans
-from neuroprior.priors import MarkovPrior, UniformPrior, learn_macros
+from neuroprior.priors import MarkovPrior, UniformPrior
 from tests.support.chains import markov_plans, markov_probs
 from tests.support.reports import QUICK
 from tests.support.sources import refuses, seeded
@@ -32,35 +30,6 @@ from tests.support.sources import refuses, seeded
 
 def found_in(plans: Plans):
     return evaluate_saved({"uniform": UniformPrior(plans.num_actions)}, plans, 0)
-
-
-def test_macro_actions_have_the_bits_that_they_save():
-    """The table holds what `learn_macros` found, in names, and adds up."""
-    words = torch.tensor([[0, 1, 2, 0], [3, 2, 2, 1]])
-    plans = Plans(words[torch.randint(2, (300, 5), generator=seeded(0))].flatten(1), 4, action_names=list("abcd"))
-    section, frames = macro_section(found_in(plans))
-    rows = frames["macros"]
-    assert {"a b c a", "d c c b"} <= set(rows["macro"])
-    macros, recoded = learn_macros(plans, 16, "compression")
-    assert rows["count"].tolist() == [macro.count for macro in macros]
-    assert (rows["gain_bits"] > 0).all()
-    # Bits before and after, counted anew: after, the definitions, two of log2(kinds) each, come on top.
-    bits = []
-    for symbols in (plans.actions, recoded.actions[recoded.mask()]):
-        counts = symbols.flatten().long().bincount()
-        share = counts[counts > 0] / counts.sum()
-        bits.append(float(-(counts[counts > 0] * share.log2()).sum()))
-    bits[1] += sum(2 * torch.tensor(4.0 + k).log2().item() for k in range(len(macros)))
-    shown = section.tables[0].rows
-    for row, value in ((shown[0], bits[0]), (shown[-1], bits[1])):
-        assert row[-1] == f"{value / plans.actions.numel():.3f}"
-    assert rows["bits_per_action"].iloc[-1] == pytest.approx(bits[1] / plans.actions.numel(), rel=1e-4)
-    assert bits[0] - bits[1] == pytest.approx(sum(macro.gain for macro in macros), rel=1e-4)
-
-
-def test_where_nothing_repeats_there_is_no_section():
-    plans = Plans(torch.randint(20, (10, 4), generator=seeded(0)), 20)
-    assert macro_section(found_in(plans)) is None
 
 
 @pytest.mark.parametrize(("often", "beyond", "repeats"), [(4, 0, {"kept"}), (2, 1, {"kept", "merged"})])
@@ -84,24 +53,6 @@ def test_gains_are_starred_where_their_interval_is_above_0():
     shown = {row[0]: row[place] for row in table.rows if row[place]}
     want = {"1": "0.3000*", "2": "0.3000", "3": "0.3000", "4": "0.0000", "6": "0.2000*"}
     assert {lag: cell.strip() for lag, cell in shown.items()} == want
-
-
-def test_the_least_of_each_input_is_starred():
-    plans = markov_plans(markov_probs(3, 2, 0, 1.5), 40, 12, 1, context=torch.arange(40) % 2)
-    chains = {f"markov-{k}": MarkovPrior(3, k).fit(replace(plans, context=None)) for k in (0, 2)}
-    part = order_section(evaluate_saved(chains, plans, 0))
-    (table,), frame = part.section.tables, part.frames["orders"]
-    bits = {name: -float(prior.log_prob(plans.actions).sum()) / math.log(2) / 480 for name, prior in chains.items()}
-    want = []
-    for row in frame.itertuples():
-        own = frame[frame["context"] == row.context]
-        cells = [f"{row.bic_bits:.4f}" + "*" * bool(row.bic_bits == own["bic_bits"].min())]
-        cells.append(f"{row.aic_bits:.4f}" + "*" * bool(row.aic_bits == own["aic_bits"].min()))
-        held = bits.get(f"markov-{row.order}") if row.context == "actions" else None
-        cells.append("" if held is None else f"{held:.4f}" + "*" * (held == min(bits.values())))
-        want.append([str(row.order), row.context.replace(" and ", ", "), f"{row.num_parameters:,}", *cells])
-    assert [[cell.strip() for cell in row] for row in table.rows] == want
-    assert sum(row[3].endswith("*") for row in want) == 2
 
 
 def test_actions_whose_share_changes_most_come_first():
@@ -138,18 +89,16 @@ def made() -> Document:
 
 
 def test_a_report_has_its_tables_and_figures(made):
-    assert {*made.tables, "motifs", "macros"} == {
-        *("plans", "actions", "lags", "orders", "calibration", "transitions", "transition_test"),
-        *("motifs", "macros"),
-        *("likeness", "drift", "drift_tests", "action_drift"),
+    assert {*made.tables, "motifs"} == {
+        *("plans", "actions", "lags", "transitions", "transition_test"),
+        *("motifs", "drift", "drift_tests", "action_drift"),
     }
     assert all(isinstance(frame, pd.DataFrame) for frame in made.tables.values())
-    names = {"scores", "lags", "orders", "calibration", "transitions", "group_transitions", "raster", "distributions"}
-    assert {*names, "drift"} <= set(made.figures)
+    assert {"scores", "lags", "transitions", "group_transitions", "drift"} <= set(made.figures)
     assert all(isinstance(figure, Figure) for figure in made.figures.values())
     boxes = [box for section in made.sections for box in section.figures]
     assert all(isinstance(box, FigureBox) and box.caption and box.alt and box.name for box in boxes)
-    assert len(made.sections) >= len(SECTIONS) - 3  # of macro-actions, motifs and conditions there may be none
+    assert len(made.sections) >= len(SECTIONS) - 4  # motifs, conditions, durations and modes
 
 
 def test_what_is_asked_for_is_done(made):
@@ -258,9 +207,8 @@ def test_few_groups_bear_no_verdict(number, enough):
     assert ("*" in said) == enough
     assert ("significant" in said) == enough
     assert ("p" in said.split("\n")) == enough  # the heading of a column
-    assert (marks(whole.figures["orders"]) > 0) == enough
     assert (marks(whole.figures["group_transitions"]) > 0) == enough
-    assert said.count(few) == (0 if enough else 7)  # the lead, and each section that would draw one
+    assert said.count(few) == (0 if enough else 6)  # the lead, and each section that would draw one
     assert whole.tables["plans"]["low"].notna().all()
     assert "over groups" in whole.lead
 
