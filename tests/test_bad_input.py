@@ -25,6 +25,7 @@ from neuroprior import (
     write_plans,
 )
 from neuroprior.__main__ import main
+from neuroprior.behaviour.report import FitOptions, ReadOptions
 from neuroprior.behaviour.report.figures import ethogram_figure
 from neuroprior.behaviour.report.plan_report import report
 from neuroprior.control import ICEMPlanner, PlanarArm, control
@@ -84,10 +85,9 @@ def test_exact_solutions_need_a_table():
         expected_score(world, world.reset(2, seeded(0)), torch.zeros(2, 1, 3, dtype=torch.long))
 
 
-@pytest.mark.parametrize("option", [{"max_gap": 0}, {"max_gap": 0.0}, {"num_actions": 0}, {"merge_repeats": True}])
-def test_options_of_files_are_not_for_plans_in_memory(option):
-    with refuses(next(iter(option)), "for files only"):
-        report(Plans(ACTIONS, 2), models=["counts"], **option)
+def test_options_of_files_are_not_for_plans_in_memory():
+    with refuses("`reading` must be left out"):
+        report(Plans(ACTIONS, 2), reading=ReadOptions())
 
 
 @pytest.mark.parametrize("number", [2.5, float("nan"), None, "3"])
@@ -99,6 +99,7 @@ def test_numbers_of_samples_are_integers(number):
 
 
 PLANS = Plans(torch.tensor([[0, 1, 1], [1, 0, 1]]), 2)
+FITTED = {"a": UniformPrior(2)}
 
 
 @pytest.mark.parametrize(
@@ -147,19 +148,16 @@ PLANS = Plans(torch.tensor([[0, 1, 1], [1, 0, 1]]), 2)
         (lambda: analysis.best_of(torch.zeros(2, 3), [2]), ["baselines", "[2]"]),
         (lambda: analysis.best_of(torch.zeros(2, 3), []), ["baselines", "[]"]),
         (lambda: analysis.best_of(torch.tensor([[0.0, torch.nan]])), ["scores[0, 1]", "NaN"]),
-        (lambda: report(PLANS, models="counts"), ["models", "a list", "['counts']"]),
-        (lambda: report(PLANS, priors=UniformPrior(2)), ["priors", "a dict"]),
-        (
-            lambda: report(PLANS, priors={"a": UniformPrior(2)}, folds=2, models=["counts"], max_steps=3),
-            ["priors", "leave folds, models, max_steps out"],
-        ),
-        (lambda: report(PLANS, priors={"a": UniformPrior(2)}, inputs=["actions"]), ["priors", "leave inputs out"]),
-        (lambda: report(PLANS, priors=[UniformPrior(2)]), ["priors", "a dict"]),
+        (lambda: FitOptions(models="counts"), ["`models` must be a list", "'counts'"]),
+        (lambda: report(PLANS, priors=UniformPrior(2)), ["`priors` must be a dict"]),
+        (lambda: report(PLANS, priors=[UniformPrior(2)]), ["`priors` must be a dict"]),
+        (lambda: report(PLANS, priors=FITTED, fits=FitOptions(max_steps=3)), ["`max_steps` must be left out"]),
+        (lambda: report(PLANS, priors=FITTED, fits=FitOptions(inputs=["actions"])), ["`inputs` must be left out"]),
         (lambda: SamplingPlanner(UniformPrior(2), 2, 4).plan(ARM, torch.zeros(1, 4)), ["numbered", "not PlanarArm"]),
         (lambda: ExhaustivePlanner(2).plan(PlanarArm, torch.zeros(1, 4)), ["a World", "not the class PlanarArm"]),
         (lambda: ICEMPlanner(2, 4).plan(cube(), torch.zeros(1, 4)), ["a ContinuousWorld", "vectors", "got PocketCube"]),
         (lambda: control(ICEMPlanner(2, 4), None, torch.zeros(1, 4), 2), ["a ContinuousWorld", "got NoneType"]),
-        (lambda: report(PLANS, models=["counts"], folds=3), ["folds: at most 2", "not 3"]),
+        (lambda: report(PLANS, fits=FitOptions(["counts"], folds=3)), ["`folds` must be from 2 to 2", "got 3"]),
     ],
 )
 def test_arguments_of_other_kinds(call, words):

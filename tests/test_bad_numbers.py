@@ -38,7 +38,7 @@ from neuroprior.behaviour import (
     ratio_difference,
     share_interval,
 )
-from neuroprior.behaviour.report.plan_report import report
+from neuroprior.behaviour.report import FitOptions, report
 from neuroprior.control import ICEMPlanner, MPPIPlanner, NoisePrior, ShootingPlanner, VectorGRU, VectorPlans
 from neuroprior.planners import expected_score, value_iteration
 from neuroprior.plans import all_plans, folds, in_parts
@@ -174,7 +174,7 @@ def test_numbers_of_folds(number):
     with refuses("folds"):
         choose_modes(PLANS, (1,), number_of_folds=number, max_iterations=1)
     with refuses("folds"):
-        report(PLANS, models=["counts"], folds=number)
+        report(PLANS, fits=FitOptions(["counts"], folds=number))
     if number != 1:
         with refuses("number" if number != 9 else "at least 9 actions"):
             in_parts(PLANS[:1], number)

@@ -10,7 +10,7 @@ import pandas as pd
 from eval.compare import figures
 from eval.compare.figures import POINTS, Style
 from eval.compare.results import AGAINST, BEST, Results, grouped, kind_of
-from eval.worlds.runs import FORMER_NAMES, across_table, plus_minus, table_by
+from eval.worlds.runs import across_table, plus_minus, table_by
 from neuroprior.behaviour.report.document import Column, Document, table
 from neuroprior.behaviour.report.figures import transition_figure
 from neuroprior.behaviour.report.page import FigureBox, Section, Table, breakable
@@ -92,7 +92,6 @@ def document(results: Results, settings: Mapping[str, Any], command: str) -> Doc
         {file: getattr(results, name) for file, name in FRAMES.items()},
         settings,
         command,
-        former_names=FORMER_NAMES,
     )
 
 

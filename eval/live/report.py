@@ -57,7 +57,6 @@ def live_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str, A
         settings,
         command,
         {"words": [lead]},
-        former_names=runs.FORMER_NAMES,
     )
 
 

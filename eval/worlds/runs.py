@@ -32,9 +32,6 @@ from neuroprior.behaviour.report.page import Table
 MAKERS = ("gymnasium", "minigrid", "mujoco")
 """Packages of which another version may make other worlds."""
 
-FORMER_NAMES = {"context": "sees"}
-"""Of columns in files, see `Document`."""
-
 Seed = restricted_number_type("Seed", int, [(">=", 0), ("<", 2**40)], docstring="A seed of everything random.")
 
 

@@ -19,12 +19,15 @@ from neuroprior.behaviour.report.figures import (
     score_figure,
     transition_figure,
 )
+from neuroprior.behaviour.report.options import FitOptions, ReadOptions
 from neuroprior.behaviour.report.page import FigureBox, Section, Table
 from neuroprior.behaviour.report.plan_report import report
 
 __all__ = [
     "Document",
     "FigureBox",
+    "FitOptions",
+    "ReadOptions",
     "Section",
     "Table",
     "condition_figure",

@@ -15,7 +15,7 @@ from neuroprior.behaviour.report.part import LISTED, Part
 from neuroprior.behaviour.report.plan_report import report
 from neuroprior.behaviour.report.scores import evaluate_saved
 from neuroprior.priors import UniformPrior
-from tests.support.reports import QUICK
+from tests.support.reports import QUICK_IN_TWO
 from tests.support.sources import refuses, seeded
 from tests.support.studies import between, study, within
 
@@ -97,7 +97,7 @@ def test_units_are_counted_by_their_condition_and_by_the_one_predicted():
 
 
 def test_a_report_has_the_section(tmp_path):
-    made = report(changed(between(12)), folds=2, out=tmp_path, sections=["file", "conditions"], **QUICK)
+    made = report(changed(between(12)), fits=QUICK_IN_TWO, out=tmp_path, sections=["file", "conditions"])
     assert made.lead.endswith(compare_conditions(changed(between(12)), generator=seeded(0)).verdict)
     names = ["condition_tests", "conditions", "condition_blocks", "condition_sequences"]
     assert {*names} <= {*made.tables}

@@ -18,10 +18,10 @@ from neuroprior.behaviour.report.scores import evaluate_saved
 from neuroprior.behaviour.report.sections import SECTIONS
 from neuroprior.plans import BLOCKS, Plans, write_plans
 from neuroprior.priors import UniformPrior
-from tests.support.reports import QUICK
+from tests.support.reports import QUICK_IN_TWO
 from tests.support.sources import refuses, seeded
 
-ONLY = {"models": ["counts"], "folds": 2, "processes": 1, "sections": ["durations"]}
+ONLY = {"fits": QUICK_IN_TWO, "sections": ["durations"]}
 
 
 def timed(telling: bool, num_plans: int = 24, length: int = 60, seed: int = 0, num_actions: int = 3) -> Plans:
@@ -213,16 +213,16 @@ def test_without_durations_there_is_no_section():
 def test_networks_with_durations():
     """They know more than those without, and the table says so."""
     plans = timed(True, 64, 12)
-    quick = QUICK | {"models": ["gru"], "inputs": ["actions", "durations"], "max_steps": 60}
-    made = report(plans, folds=2, **quick, sections=["scores", "durations"])
+    fits = replace(QUICK_IN_TWO, models=["gru"], inputs=["actions", "durations"], max_steps=60)
+    made = report(plans, fits=fits, sections=["scores", "durations"])
     bits = made.tables["plans"].set_index("context")["bits_per_action"]
     assert bits["actions and durations"] < bits["actions"] - 0.1
     row = made.tables["next_by_duration"].set_index("model").loc["gru"]
     assert row["gain"] == pytest.approx(bits["actions"] - bits["actions and durations"])
     with refuses("no durations"):
-        report(replace(plans, durations=None), inputs=["durations"], **ONLY)
+        report(replace(plans, durations=None), fits=replace(QUICK_IN_TWO, inputs=["durations"]))
     with refuses("durations are an input of combined, transformer, gru"):
-        report(plans, inputs=["durations"], **ONLY)
+        report(plans, fits=replace(QUICK_IN_TWO, inputs=["durations"]), sections=["durations"])
 
 
 def test_at_most_some_panels_are_drawn():

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from neuroprior.behaviour.report.document import Document
 from neuroprior.behaviour.report.fits import counted
+from neuroprior.behaviour.report.options import FitOptions, ReadOptions
 from neuroprior.behaviour.report.page import FigureBox
 from neuroprior.behaviour.report.plan_report import report
 from neuroprior.behaviour.report.scores import evaluate_saved
@@ -24,7 +25,7 @@ from neuroprior.behaviour.report.sections import (
 from neuroprior.plans import Plans
 from neuroprior.priors import MarkovPrior, UniformPrior
 from tests.support.chains import markov_plans, markov_probs
-from tests.support.reports import QUICK
+from tests.support.reports import QUICK_IN_TWO
 from tests.support.sources import refuses, seeded
 
 
@@ -79,7 +80,7 @@ def test_actions_whose_share_changes_most_come_first():
         assert row.change == pytest.approx(own[1] - own[0])
 
 
-ASKED: dict[str, Any] = {"folds": 2, "skip": 1, "seed": 5} | QUICK
+ASKED: dict[str, Any] = {"skip": 1, "fits": replace(QUICK_IN_TWO, seed=5)}
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +103,7 @@ def test_a_report_has_its_tables_and_figures(made):
 
 
 def test_what_is_asked_for_is_done(made):
-    asked = {name: value for name, value in ASKED.items() if name not in ("models", "processes")}
+    asked = {"folds": 2, "skip": 1, "seed": 5, "max_steps": 3}
     assert made.settings | asked == made.settings
 
 
@@ -155,22 +156,29 @@ def test_priors_by_name_are_scored(skip):
     assert scores["bits_per_action"][0] == pytest.approx(float(bits), abs=1e-5)
 
 
+PLANS = markov_plans(markov_probs(3, 1, 0), 8, 5, 1)
+
+
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "fits", "words"),
     [
-        ({"models": []}, ("models", "none")),
-        ({"inputs": ["nodes"]}, ("inputs", "nodes")),
-        ({"inputs": ["context"]}, ("inputs", "no context")),
-        ({"sections": ["weather"]}, ("sections", "weather")),
-        ({"num_actions": 3}, ("num_actions", "files")),
-        ({"priors": {}}, ("priors", "at least one")),
-        ({"priors": {"a": UniformPrior(3)}, "folds": 2}, ("priors", "folds")),
-        ({"test": markov_plans(markov_probs(3, 1, 0), 4, 5, 1), "folds": 2}, ("folds", "test")),
+        ({}, {"models": []}, "`models` must be a list of some of counts"),
+        ({}, {"inputs": ["nodes"]}, "`inputs` must be a list of some of"),
+        ({}, {"inputs": ["context"]}, "`inputs` must hold more"),
+        ({}, {"effort": "quick"}, "effort"),
+        ({}, {"effort": "full", "models": ["gru"]}, "`effort` must be left out"),
+        ({}, {"seed": 2**50}, "`seed` must be from 0 to 1125899906842623"),
+        ({"sections": ["weather"]}, {}, "`sections` must be a list of some of file"),
+        ({"reading": ReadOptions()}, {}, "`reading` must be left out"),
+        ({"priors": {}}, {}, "`priors` must be a dict"),
+        ({"priors": {"a": UniformPrior(3)}}, {"folds": 2}, "`folds` must be left out"),
+        ({"priors": {"a": UniformPrior(3)}, "test": PLANS}, {}, "`test` must be left out"),
+        ({"test": PLANS}, {"folds": 2}, "`folds` must be left out"),
     ],
 )
-def test_what_cannot_be_reported_is_refused(options, words):
-    with refuses(*words):
-        report(markov_plans(markov_probs(3, 1, 0), 8, 5, 1), **options)
+def test_what_cannot_be_reported_is_refused(options, fits, words):
+    with refuses(words):
+        report(PLANS, fits=FitOptions(**fits), **options)
 
 
 def verdicts(document: Document) -> str:
@@ -200,7 +208,7 @@ def animals(number: int, sessions: int = 8) -> Plans:
 @pytest.mark.parametrize(("number", "enough"), [pytest.param(3, False, marks=pytest.mark.slow), (4, False), (5, True)])
 def test_few_groups_bear_no_verdict(number, enough):
     """Below five animals nothing is starred, ringed, dotted or called best; the numbers stand."""
-    whole = report(animals(number), folds=2, **QUICK)
+    whole = report(animals(number), fits=QUICK_IN_TWO)
     said, few = verdicts(whole), f"{number} groups are too few for a verdict"
     assert (few in whole.lead) != enough
     assert ("The best model" in whole.lead) == enough
@@ -216,7 +224,7 @@ def test_few_groups_bear_no_verdict(number, enough):
 def test_parts_of_a_plan_are_not_plans():
     """A single long session is one: its parts have intervals, and bear no verdict."""
     (plan,) = markov_plans(markov_probs(3, 1, 0, 1.5), 1, 400, 1).actions
-    found = report(Plans(plan[None], 3), folds=2, **QUICK)
+    found = report(Plans(plan[None], 3), fits=QUICK_IN_TWO)
     assert "over parts of the plan" in found.lead
     assert "1 plan is too few for a verdict" in found.lead
     assert "*" not in verdicts(found)
@@ -227,7 +235,7 @@ def test_actions_that_never_occur_count_in_uniform_and_the_report_says_so(names)
     """Bits of uniform are those of all names: the tables say which never occur, and what the others alone take."""
     actions = torch.randint(2, (30, 8), generator=seeded(0)) * 2 + 1
     plans = Plans(actions, 6, action_names=names)
-    made = report(plans, **QUICK, sections=["file", "scores"], folds=2)
+    made = report(plans, fits=QUICK_IN_TWO, sections=["file", "scores"])
     assert made.frames["plans"].set_index("model")["bits_per_action"]["uniform"] == pytest.approx(math.log2(6))
     listed = "0, 2, 4, 5 never occur" if names is None else "Run, hide, eat, drink never occur"
     first, scores = (next(s for s in made.sections if s.title == title) for title in ("Plans", "Held-out scores"))
@@ -237,5 +245,5 @@ def test_actions_that_never_occur_count_in_uniform_and_the_report_says_so(names)
 
 def test_where_all_actions_occur_nothing_is_said_of_those_that_never_do():
     plans = Plans(torch.randint(2, (30, 8), generator=seeded(0)), 2)
-    whole = report(plans, **QUICK, sections=["file", "scores"], folds=2)
+    whole = report(plans, fits=QUICK_IN_TWO, sections=["file", "scores"])
     assert not any("never" in table.caption for section in whole.sections for table in section.tables)
