@@ -38,6 +38,9 @@ LEAST_VARIANCE = 1e-6
 TIE = 1e-8
 """Statistics that differ by less than this, or by less than this share, are tied: rounding depends on sums' order."""
 
+MAX_WORK = 5 * 10**8
+"""Numbers that permutations may compute, some ten seconds on one core; beyond, fewer are made."""
+
 NUMBERS_AT_ONCE = 2**20
 """Statistics that are in memory at a time."""
 
@@ -150,11 +153,7 @@ class ConditionComparison:
 
 
 def compare_conditions(
-    plans: Plans,
-    permutations: int = 9_999,
-    generator: torch.Generator | None = None,
-    *,
-    max_work: int = 5 * 10**8,
+    plans: Plans, permutations: int = 9_999, generator: torch.Generator | None = None
 ) -> ConditionComparison:
     """Whether behaviour differs between the conditions of plans.
 
@@ -172,13 +171,12 @@ def compare_conditions(
 
     Args:
         plans: with a `condition`. An end symbol is an action like others.
-        permutations: at most so many random ones.
+        permutations: at most so many random ones; fewer where they take more than `MAX_WORK`, but at least
+            `FEWEST_PERMUTATIONS`.
         generator: draws them.
-        max_work: numbers that they may compute, some ten seconds on one core; fewer permutations are made if need be,
-            but at least `FEWEST_PERMUTATIONS`.
 
     Raises:
-        ValueError: the plans have no condition, or `permutations` or `max_work` is below 1.
+        ValueError: the plans have no condition, or `permutations` is below 1.
 
     Example:
         >>> first, second = torch.tensor([[0, 1] * 10]).repeat(8, 1), torch.tensor([[0, 0, 1, 1] * 5]).repeat(8, 1)
@@ -188,7 +186,7 @@ def compare_conditions(
         True
     """
     check_are_plans(plans)
-    check_sizes(permutations=permutations, max_work=max_work)
+    check_sizes(permutations=permutations)
     design = PermutationDesign.of(plans)
     names = [
         plans.condition_names[c] if plans.condition_names else f"condition {c}" for c in design.conditions.tolist()
@@ -204,7 +202,7 @@ def compare_conditions(
     chains = ConditionChains.of(flat, block, design.unit)
     num = len(names)
     cost = num * (chains.cost + sum(numbers.smoothed.numel() for numbers in found) // 8)
-    drawn = min(permutations, max(max_work // max(cost, 1), FEWEST_PERMUTATIONS))
+    drawn = min(permutations, max(MAX_WORK // max(cost, 1), FEWEST_PERMUTATIONS))
     labellings = design.labellings(drawn, generator)
     families, statistics = [], {}
     for numbers in found:

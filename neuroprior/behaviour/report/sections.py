@@ -195,7 +195,7 @@ def transition_section(found: Evaluation) -> Part | None:
     if int(plans.mask().sum(1).max()) < 2:
         return None
     result = transitions(plans, generator=_shuffles())
-    names, tested = action_names(plans), result.test == "permutation"
+    names = action_names(plans)
     groups = group_names(plans, result.groups) if plans.group is not None else []
     probs, each = result.probs(), result.group_probs()
     of_groups = zip(groups, result.group_counts, each, result.cell_p_values, strict=False)
@@ -206,7 +206,7 @@ def transition_section(found: Evaluation) -> Part | None:
             "to": names[b],
             "count": int(counts[a, b]),
             "probability": float(matrix[a, b]),
-            "p_value": float(p_values[a, b]) if tested and p_values is not None else None,
+            "p_value": None if p_values is None else float(p_values[a, b]),
         }
         for group, counts, matrix, p_values in [("all", result.counts, probs, None), *of_groups]
         for a, b in counts.nonzero().tolist()
@@ -217,7 +217,7 @@ def transition_section(found: Evaluation) -> Part | None:
     boxes = [FigureBox(figures.transition_figure(probs, names), caption, "Transition matrix.", "transitions")]
     if len(groups) > 1:
         row = {"groups": len(groups), "test": result.test, "permutations": result.permutations}
-        test = pd.DataFrame([row | {"statistic": result.statistic, "p_value": result.p_value if tested else None}])
+        test = pd.DataFrame([row | {"statistic": result.statistic, "p_value": result.p_value}])
         few = too_few(plans)
         tested_by = "That groups have the same transitions is tested by permuting plans between them, where they have"
         text.append(_no_verdict(few) or f"{tested_by} enough. Marked cells differ at p < 0.05, corrected for all.")
@@ -225,7 +225,7 @@ def transition_section(found: Evaluation) -> Part | None:
         if not few:
             caption = "Whether groups have the same transitions (p: blank if not tested)."
             tables.append(table(test, columns, caption, align="rrr"))
-        significant = (result.cell_p_values < SIGNIFICANT) & tested & (not few)
+        significant = (result.cell_p_values < SIGNIFICANT) & (not few)
         figure = figures.group_transition_figure(each, probs, names, groups, significant)
         caption = "Each group's transition probabilities less those of all."
         boxes.append(FigureBox(figure, caption, "Differences of the groups' transitions.", "group_transitions"))

@@ -28,11 +28,11 @@ from tests.support.sources import FALSE_ALARM, refuses, seeded
 
 
 @settings(max_examples=50, deadline=None, derandomize=True)
-@given(st.lists(st.floats(-100, 100), min_size=2, max_size=9), st.floats(0.1, 50), st.sampled_from([0.5, 0.95, 0.99]))
-def test_a_ratio_over_equal_sizes_is_a_mean(totals, size, level):
+@given(st.lists(st.floats(-100, 100), min_size=2, max_size=9), st.floats(0.1, 50))
+def test_a_ratio_over_equal_sizes_is_a_mean(totals, size):
     values = np.array(totals) / size
-    found = ratio_difference(totals, [size] * len(totals), level)
-    assert found[:3] == pytest.approx(tuple(mean_interval(values, level)), rel=1e-6, abs=1e-9)
+    found = ratio_difference(totals, [size] * len(totals))
+    assert found[:3] == pytest.approx(tuple(mean_interval(values)), rel=1e-6, abs=1e-9)
     if np.ptp(values) > 1e-6:
         assert found.p_value == pytest.approx(float(stats.ttest_1samp(values, 0).pvalue), rel=1e-6, abs=1e-12)
 
@@ -44,7 +44,6 @@ def test_a_ratio_by_hand():
     assert found[:3] == pytest.approx((2, 2 - t * error, 2 + t * error), abs=1e-6)
     # With 2 degrees of freedom P(|T| > t) = 1 - t / sqrt(2 + t**2).
     assert found.p_value == pytest.approx(1 - (2 / error) / math.sqrt(2 + (2 / error) ** 2))
-    assert ratio_difference([2, 3, 7], [1, 2, 3], level=0.9).low == pytest.approx(2 - 2.919986 * error, abs=1e-6)
 
 
 def test_a_ratio_without_spread():
@@ -67,7 +66,7 @@ def test_a_ratio_of_differences_is_paired_and_antisymmetric():
     [
         ([1], [1], "totals"),
         ([1, 2], [1], "sizes"),
-        ([1, 2], [1, 2, 3], "sizes: 2 are expected"),
+        ([1, 2], [1, 2, 3], "`sizes` must have 2 values"),
         ([1, 2], [0, 0], "sizes"),
         ([1, 2], [-1, 2], "sizes"),
         ([[1, 2]], [1, 2], "totals"),

@@ -395,11 +395,12 @@ def test_random_permutations_give_the_exact_p_value():
     assert again.p_value == drawn.p_value
 
 
-def test_work_is_bounded():
+def test_work_is_bounded(monkeypatch):
     plans = study(8, between(14, 1), length=20, num_actions=3)
 
     def drawn(max_work):
-        return compare_conditions(plans, generator=seeded(0), max_work=max_work).labellings - 1
+        monkeypatch.setattr("neuroprior.behaviour.analysis.conditions.MAX_WORK", max_work)
+        return compare_conditions(plans, generator=seeded(0)).labellings - 1
 
     assert drawn(1) == drawn(300_000) == 999
     assert 999 < drawn(10**6) < 3431
