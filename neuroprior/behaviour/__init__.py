@@ -33,11 +33,9 @@ from neuroprior.behaviour.analysis.lags import LagInformation, mutual_informatio
 from neuroprior.behaviour.analysis.modes import (
     ModeChoice,
     choose_modes,
-    match_modes,
     mode_frame,
     mode_plans,
     mode_table,
-    mode_transitions,
 )
 from neuroprior.behaviour.analysis.motifs import Motif, motifs
 from neuroprior.behaviour.analysis.permutation_design import PermutationDesign
@@ -93,12 +91,10 @@ __all__ = [
     "choose_modes",
     "compare_conditions",
     "holm",
-    "match_modes",
     "mean_interval",
     "mode_frame",
     "mode_plans",
     "mode_table",
-    "mode_transitions",
     "motifs",
     "mutual_information",
     "paired_difference",

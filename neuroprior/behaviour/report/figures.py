@@ -30,7 +30,6 @@ from neuroprior.behaviour.report.drawing import (
     colors,
     dot,
     drawn,
-    expect_columns,
     expect_some,
     floats,
     legend,
@@ -109,7 +108,6 @@ def score_figure(scores: pd.DataFrame) -> Figure:
             or "actions and durations"), `bits_per_action`, `low`, `high`; a model may have a row for each input.
     """
     expect_some("scores", scores)
-    expect_columns("scores", scores, "model context bits_per_action low high")
     best = scores.assign(bits=floats(scores["bits_per_action"])).groupby("model", sort=False)["bits"].min()
     models = best.fillna(np.inf).sort_values(ascending=False, kind="stable").index
     figure, (axes,) = panels(1, 1, (WIDTH, 0.9 + 0.36 * max(len(models), 2)))
@@ -153,7 +151,6 @@ def lag_figure(lags: pd.DataFrame) -> Figure:
             `low`, `high`, and `critical_value`, the 95 % quantile of what independent actions would give, or missing.
     """
     expect_some("lags", lags)
-    expect_columns("lags", lags, "what model context lag bits low high critical_value")
     figure, (axes,) = panels(1, 1, (WIDTH, 3.7))
     sizes = np.abs(floats(lags["bits"]))
     sizes = sizes[sizes > 0]
@@ -189,7 +186,6 @@ def dwell_figure(dwell: pd.DataFrame) -> Figure:
             unit of the natural logarithm.
     """
     expect_some("dwell", dwell)
-    expect_columns("dwell", dwell, "action number zero law low high density fitted")
     actions = list(dict(iter(dwell.groupby("action", sort=False))).items())
     shown = sorted(actions, key=lambda item: -int(item[1]["number"].iloc[0]))[:MOST_PANELS]
     across = min(len(shown), 3)
@@ -306,8 +302,6 @@ def condition_figure(means: pd.DataFrame, values: pd.DataFrame, paired: bool = F
         paired: each unit is under every condition: lines join its dots.
     """
     expect_some("means", means)
-    expect_columns("means", means, "feature condition mean low high")
-    expect_columns("values", values, "feature unit condition value")
     conditions = list(means["condition"].unique())
     features = list(means["feature"].unique())
     height = 0.62 + (0.36 if paired else 0.26) * len(conditions)
@@ -341,7 +335,6 @@ def motif_figure(motifs: pd.DataFrame) -> Figure:
             `count`; drawn from the top down.
     """
     expect_some("motifs", motifs)
-    expect_columns("motifs", motifs, "sequence ratio low high count")
     names = ["\n".join(wrap(clean(name), 36, max_lines=4, placeholder=" …")) for name in motifs["sequence"]][::-1]
     heights = np.array([0.5 + 0.5 * (1 + name.count("\n")) for name in names])
     figure, (axes,) = panels(1, 1, (WIDTH, 0.9 + 0.3 * max(heights.sum(), 2)))
@@ -389,7 +382,7 @@ def ethogram_figure(plans: Plans) -> Figure:
     plans = plans if plans.end is None else plans.without_end()
     mask = plans.mask().cpu().numpy()
     if not mask.any():
-        raise ValueError("plans: at least one action is expected; without any there is no figure")
+        raise ValueError("`plans` must have at least one action: without any there is no figure.")
     names = action_names(plans)
     count = plans.actions.cpu()[torch.from_numpy(mask)].long().bincount(minlength=len(names)).numpy()
     palette, keys, columns = _strip_colors(count, names)
@@ -498,7 +491,6 @@ def occupancy_figure(occupancy: pd.DataFrame) -> Figure:
     Args:
         occupancy: columns `mode`, `part` (from 1), `share`, `low`, `high`.
     """
-    expect_columns("occupancy", occupancy, "mode part share low high")
     expect_some("occupancy", occupancy)
     figure, (axes,) = panels(1, 1, (WIDTH, 2.8))
     names = list(occupancy["mode"].unique())
@@ -521,8 +513,6 @@ def drift_figure(drift: pd.DataFrame, plans: pd.DataFrame) -> Figure:
             drawn, the one that takes the most bits at the top.
         plans: `index` of a plan in its group, `bits` per action; at most `MOST_PLANS` are drawn.
     """
-    expect_columns("drift", drift, "what name bits low high")
-    expect_columns("plans", plans, "index bits")
     parts, groups = (drift[drift["what"] == what] for what in ("place", "group"))
     ranked = groups[groups["bits"].notna()].sort_values("bits", kind="stable")
     ranked = ranked.iloc[_evenly(len(ranked), MOST_GROUPS)]

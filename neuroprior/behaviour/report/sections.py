@@ -20,7 +20,7 @@ from neuroprior.behaviour.report.document import Column, table
 from neuroprior.behaviour.report.durations import duration_section
 from neuroprior.behaviour.report.fits import ACTIONS
 from neuroprior.behaviour.report.modes import mode_section
-from neuroprior.behaviour.report.page import FigureBox, Section, Table
+from neuroprior.behaviour.report.page import FigureBox, Section
 from neuroprior.behaviour.report.part import LISTED, SIGNIFICANT, Part, action_names, group_names, p_text
 from neuroprior.behaviour.report.scores import Evaluation
 from neuroprior.plans import Plans, constant_context, has_patterns
@@ -34,24 +34,8 @@ LEAST = 1e-9  # bits: below, a gain is 0 but for rounding
 
 
 def file_section(found: Evaluation) -> Part:
-    """What is in the file."""
-    frame = action_frame(found.plans)
-    tables, boxes = plans_tables(found.plans, frame), []
-    if len(frame):
-        caption = "Each row a plan, each colour an action" + (", by group" if found.plans.group is not None else "")
-        caption += (" and condition" if found.plans.condition is not None else "") + "."
-        alt = "The plans as rows of coloured strips over time."
-        boxes = [FigureBox(figures.ethogram_figure(found.plans), caption, alt, "ethogram")]
-    return Part(Section("Plans", tables=tables, figures=boxes), {"actions": frame})
-
-
-def plans_tables(plans: Plans, frame: pd.DataFrame) -> list[Table]:
-    """What was read: how many plans of which kind, with what readers noted of them, and the commonest of the actions.
-
-    Args:
-        plans: the plans.
-        frame: their `action_frame`.
-    """
+    """What was read: how many plans of which kind, the commonest of their actions, and the plans over time."""
+    plans, frame = found.plans, action_frame(found.plans)
     columns = {"plans": "plans:,", "actions": "actions:,", "shortest": "shortest", "longest": "longest"}
     columns |= {"kinds of\nactions": "kinds of actions", "groups": "groups", "context": "context"}
     columns |= {"conditions": "conditions"} if plans.condition is not None else {}
@@ -68,7 +52,13 @@ def plans_tables(plans: Plans, frame: pd.DataFrame) -> list[Table]:
     caption = f"The {LISTED} commonest of {len(frame)}." if len(frame) > LISTED else ""
     never = never_occur(plans.actions[plans.mask()].unique().cpu().numpy(), plans.num_actions, plans.action_names)
     caption = f"{caption} {never[:1].upper()}{never[1:]}.".strip() if never else caption
-    return [described, table(frame[:LISTED], counted, caption, "Actions")]
+    tables, boxes = [described, table(frame[:LISTED], counted, caption, "Actions")], []
+    if len(frame):
+        caption = "Each row a plan, each colour an action" + (", by group" if plans.group is not None else "")
+        caption += (" and condition" if plans.condition is not None else "") + "."
+        alt = "The plans as rows of coloured strips over time."
+        boxes = [FigureBox(figures.ethogram_figure(plans), caption, alt, "ethogram")]
+    return Part(Section("Plans", tables=tables, figures=boxes), {"actions": frame})
 
 
 def action_frame(plans: Plans) -> pd.DataFrame:

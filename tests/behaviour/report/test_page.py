@@ -15,10 +15,9 @@ from hypothesis import strategies as st
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
-from neuroprior.behaviour.report.drawing import FEWER, KINDS, MARKOV, MORE, SPARE, colors, drawn, lines, short
+from neuroprior.behaviour.report.drawing import FEWER, KINDS, MARKOV, MORE, SPARE, drawn, short
 from neuroprior.behaviour.report.figures import (
     MOST_BINS,
-    MOST_PLANS,
     STRIPS,
     drift_figure,
     dwell_figure,
@@ -272,23 +271,6 @@ def test_lines_are_seen_on_light_and_dark_pages(paper):
         assert high / low >= 3, color
 
 
-def test_colors_are_those_of_the_kind_of_model():
-    names = [
-        "uniform",
-        "markov-0",
-        "markov-2, context",
-        "markov-12",
-        "Context tree",
-        "GRU",
-        "transformer",
-        "combined",
-    ]
-    expected = [KINDS["uniform"], MARKOV[0], MARKOV[2], MARKOV[-1]]
-    assert list(colors(names)) == expected + [KINDS[kind] for kind in ("tree", "gru", "transformer", "combined")]
-    assert list(colors(["this", "gru", "that"])) == [SPARE[0], KINDS["gru"], SPARE[1]]
-    assert list(lines(["gru", "gru, context"])) == [(KINDS["gru"], "-"), (KINDS["gru"], "--")]
-
-
 def test_names_are_cut_in_the_middle():
     assert short("groom left forepaw while rearing", 15) == "groom lef…aring"
     assert short("a\n b\x00") == "a b\N{REPLACEMENT CHARACTER}"
@@ -341,37 +323,13 @@ def test_the_groups_that_differ_most_are_drawn():
     assert "12 of 30 groups" in figure.get_suptitle()
     shown = panels[-1].images[0].get_array()
     assert [to_hex(shown[0, b, :3]) for b in (0, 1)] == [MORE, FEWER]
-    with pytest.raises(ValueError, match="group_names: at least one is expected"):
+    with pytest.raises(ValueError, match="`group_names` must not be empty"):
         group_transition_figure(np.empty((0, 2, 2)), pooled, ["a", "b"], [], np.empty((0, 2, 2)))
-
-
-def test_motifs_stand_where_they_are():
-    rows = [
-        {"sequence": "a > b", "ratio": 4.0, "low": 2.0, "high": 5.0, "count": 10},
-        {"sequence": "b > a", "ratio": 0.0, "low": 0.0, "high": 0.5, "count": 0},
-    ]
-    axes = motif_figure(pd.DataFrame(rows)).axes[0]
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["b > a", "a > b"]
-    marks = {line.get_marker(): line for line in axes.lines}
-    assert (marks["o"].get_xdata()[0], marks["o"].get_color()) == (4.0, MORE)
-    assert (marks["<"].get_xdata()[0] < 0.25, marks["<"].get_color()) == (True, FEWER)
-
-
-def test_many_plans_are_thinned_and_groups_ranked():
-    plans = pd.DataFrame({"index": range(50_000), "bits": np.arange(50_000) / 1000})
-    drift = [("place", f"part {n}", *estimate(1)) for n in range(10)]
-    drift += [("group", "low", *estimate(1)), ("group", "high", *estimate(2))]
-    figure = drift_figure(pd.DataFrame(drift, columns=["what", "name", "bits", "low", "high"]), plans)
-    within, between, below = figure.axes
-    assert [axes.get_title(loc="left") for axes in (within, below)] == ["within plans", "groups"]
-    assert len(between.lines[0].get_xdata()) == MOST_PLANS
-    assert np.allclose(between.lines[1].get_ydata(), between.lines[1].get_xdata() / 1000)
-    assert [label.get_text() for label in below.get_yticklabels()] == ["low", "high"]
 
 
 @pytest.mark.parametrize("make", [score_figure, lag_figure, motif_figure])
 def test_nothing_to_draw_is_an_error(make):
-    with pytest.raises(ValueError, match="at least one is expected"):
+    with pytest.raises(ValueError, match="must not be empty"):
         make(pd.DataFrame())
 
 

@@ -17,11 +17,11 @@ from neuroprior.behaviour import (
     mode_frame,
     mode_plans,
     mode_table,
-    mode_transitions,
     pieces,
     score,
     score_bits,
 )
+from neuroprior.behaviour.analysis.modes import mode_transitions
 from neuroprior.priors import ContextTreePrior, MarkovPrior, SwitchingPrior, UniformPrior, forecast, infer
 from neuroprior.worlds import cube, gridworld
 from tests.support.pinned.data import behaviour, timed
