@@ -13,7 +13,7 @@ from eval.compare.results import AGAINST, BEST, Results, grouped, kind_of
 from eval.worlds.runs import across_table, plus_minus, table_by
 from neuroprior.behaviour.report.document import Column, Document, table
 from neuroprior.behaviour.report.figures import transition_figure
-from neuroprior.behaviour.report.page import FigureBox, Section, Table, breakable
+from neuroprior.behaviour.report.page import FigureBox, Section, Table
 
 FRAMES = {name: name for name in ("rows", "paired", "efficiency", "bits", "words", "reasons", "across", "combined")}
 FRAMES |= {"growth": "curriculum"}
@@ -52,6 +52,11 @@ TRANSITIONS = (
     "How often each action follows each in plans sampled from a prior after the last round of the curriculum: means"
     " over seeds."
 )
+
+
+def breakable(name: str) -> str:
+    """A long name, which may be broken where its words end."""
+    return name.replace("_", "_\N{ZERO WIDTH SPACE}")
 
 
 def document(results: Results, settings: Mapping[str, Any], command: str) -> Document:

@@ -95,10 +95,6 @@ class ConditionPrediction:
         p_value: of the accuracy, by permutation; of equal accuracies that with the larger mean log odds is the better.
         log_odds: float64 `[B, C]`: the held-out log2-likelihood of each block under each condition, less the mean of
             those under the others.
-        sequences: int64 `[K, 2]`: the transitions that occurred; -1 for the beginning of a plan.
-        carried: float64 `[K]`: what each adds to the log odds of the right condition, bits per action in all; below 0
-            where it misleads.
-        speaks_for: int64 `[K]`: the rank of the condition under which it is most probable.
     """
 
     gain: Difference
@@ -106,9 +102,6 @@ class ConditionPrediction:
     expected: float
     p_value: float
     log_odds: Tensor
-    sequences: Tensor
-    carried: Tensor
-    speaks_for: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -388,7 +381,7 @@ def _predicted(
     chains: ConditionChains, design: PermutationDesign, labellings: Tensor, actions: Tensor
 ) -> tuple[ConditionPrediction, Tensor, Tensor]:
     """The prediction; the bits that knowing the condition saves, and the accuracy, under each labelling `[P]`."""
-    num, label = len(design.conditions), design.label
+    num = len(design.conditions)
     gains = chains.gains(labellings, num)  # [C, B, P]
     right = gains.gather(0, labellings.long()[None])[0]
     bits = right.sum(0)
@@ -408,18 +401,8 @@ def _predicted(
     sizes = torch.zeros(units, dtype=torch.double).index_add_(0, design.unit, actions)
     mean, low, high, _ = ratio_difference(saved, sizes)
     gain = Difference(mean, low, high, float(_shares_reaching(bits)[0]))
-    carried, speaks_for = chains.carried(label, num)
-    prediction = ConditionPrediction(
-        gain,
-        float(share[0]),
-        float(share.mean()),
-        float(_shares_reaching(order)[0]),
-        odds[:, :, 0].T,
-        chains.sequences,
-        carried / actions.sum(),
-        speaks_for,
-    )
-    return prediction, bits, order
+    p_value = float(_shares_reaching(order)[0])
+    return ConditionPrediction(gain, float(share[0]), float(share.mean()), p_value, odds[:, :, 0].T), bits, order
 
 
 def _shares_reaching(statistics: Tensor) -> Tensor:

@@ -63,7 +63,6 @@ def motifs(
     plans: Plans,
     lengths: Sequence[int] = (3, 4, 5, 6),
     top: int | None = None,
-    collapse_repeats: bool = False,
 ) -> list[Motif]:
     """The most over- and under-represented sequences of actions.
 
@@ -88,7 +87,6 @@ def motifs(
         plans: an end symbol is an action like others.
         lengths: numbers of actions, n.
         top: how many to return; None for all.
-        collapse_repeats: merge each run of one action into a single action first, so that runs do not fill the list.
 
     Returns:
         Those with a corrected p-value of up to `LEVEL` first: over-represented ones, then under-represented ones; then
@@ -96,8 +94,7 @@ def motifs(
         often with a larger ratio but fewer counts.
 
     Raises:
-        ValueError: a length below 2, or of 2 with `collapse_repeats`, as successive actions are then never
-            independent; a repeated length or none; `top` below 1.
+        ValueError: a length below 2; a repeated length or none; `top` below 1.
 
     Example:
         >>> plans = Plans(torch.tensor([[0, 1, 2, 3, 1, 0, 3, 2, 0, 1, 2, 1]]).repeat(5, 1), 4)
@@ -105,17 +102,14 @@ def motifs(
         [(3, 1, 0)]
     """
     lengths = as_list("lengths", lengths)
-    least = 3 if collapse_repeats else 2
     for n in lengths:
-        if not isinstance(n, int) or isinstance(n, bool) or n < least:
-            why = " with collapse_repeats" if collapse_repeats else ""
-            raise ValueError(f"`lengths` must be at least {least}{why}, got {n!r}.")
+        if not isinstance(n, int) or isinstance(n, bool) or n < 2:
+            raise ValueError(f"`lengths` must be at least 2, got {n!r}.")
     if not lengths or len(set(lengths)) < len(lengths):
         raise ValueError(f"`lengths` must be different integers, one or more, got {list(lengths)}.")
     if top is not None:
         check_sizes(top=top)
     flat = FlatPlans.of(plans)
-    flat = flat.without_repeats() if collapse_repeats else flat
     found, tests = [], 0
     for length, middle in _middles(flat, sorted(lengths)):
         start = flat.starts(length)

@@ -260,12 +260,12 @@ def _contexts_from_0(plans: Plans, test: Plans | None) -> tuple[Plans, Plans | N
     contexts = [some.context for some in (plans, test) if some is not None and some.context is not None]
     named = plans.context_names is not None or (test is not None and test.context_names is not None)
     if contexts and contexts[0].is_floating_point() and not contexts[0].shape[-1]:
-        raise ValueError("context: it has no features; leave it out of the plans")
+        raise ValueError("`context` must have one feature at least, or be left out.")
     if not contexts or named or contexts[0].is_floating_point():
         return plans, test
     present = torch.cat([context.flatten().long() for context in contexts]).unique()
     if int(present[0]) < 0:
-        raise ValueError(f"context: numbers from 0 are expected, not {int(present[0])}")
+        raise ValueError(f"`context` must be numbers from 0, got {int(present[0])}.")
     new = [torch.searchsorted(present, context.long().contiguous()) for context in contexts]
     return replace(plans, context=new[0]), None if test is None else replace(test, context=new[-1])
 

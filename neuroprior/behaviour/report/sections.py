@@ -28,7 +28,6 @@ from neuroprior.plans.columns import never_occur
 
 MOST_LAG = 20
 LISTED_LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 20)
-MANY_REPEATS = 0.2  # of all actions: beyond, over-represented sequences are also sought with repeats merged
 BEGINNING = 5  # actions of a plan that do not count in drift
 LEAST = 1e-9  # bits: below, a gain is 0 but for rounding
 
@@ -226,15 +225,12 @@ def transition_section(found: Evaluation) -> Part | None:
 def motif_section(found: Evaluation) -> Part | None:
     """Over-represented sequences."""
     plans, names = found.plans, action_names(found.plans)
-    again = (plans.actions[:, 1:] == plans.actions[:, :-1])[plans.mask()[:, 1:]].double().mean()
-    rows = [
-        {"repeats": "merged" if merged else "kept", "sequence": " ".join(names[action] for action in one.actions)}
+    frame = pd.DataFrame(
+        {"sequence": " ".join(names[action] for action in one.actions)}
         | {key: value for key, value in asdict(one).items() if key != "actions"}
-        for merged in ((False, True) if float(again) > MANY_REPEATS else (False,))
-        for one in motifs(plans, top=LISTED, collapse_repeats=merged)
+        for one in motifs(plans, top=LISTED)
         if one.corrected < SIGNIFICANT
-    ]
-    frame = pd.DataFrame(rows)
+    )
     columns: Mapping[str, Column] = {
         "sequence": "sequence",
         "count": "count:,",
@@ -244,25 +240,21 @@ def motif_section(found: Evaluation) -> Part | None:
         "p": lambda row: p_text(row.corrected),
     }
     few = too_few(plans)
-    tables, boxes = [], []
-    for repeats, own in frame.groupby("repeats", sort=False) if rows else []:
-        merged = ", repeats of an action merged" * (repeats == "merged")
-        p = "Listed by" if few else "p:"
-        caption = f"Against a chain of order n - 2{merged}. {p} Fisher's exact test, corrected for all (Holm)."
-        tables.append(table(own, _without_p(columns, few), caption))
-        alt = "Over-represented sequences: " + "; ".join(own["sequence"][:5])
-        figure = figures.motif_figure(own)
-        boxes.append(
-            FigureBox(figure, f"Times as often as expected{merged}.", alt, "motifs" + "_merged" * bool(merged))
-        )
     text = [
         "Sequences of three to six actions that occur more (or less) often than their parts predict: than under a chain"
         " fitted to how often the sequence without its first, and without its last action occurs. All plans are taken"
         " to be of one chain: where groups differ, sequences of some of them are over-represented, too. One such"
         " sequence makes others over-represented that share its beginning.",
-        *([] if rows else ["There are none (p < 0.05, corrected for all sequences)."]),
+        *([] if len(frame) else ["There are none (p < 0.05, corrected for all sequences)."]),
         *([_no_verdict(few)] if few else []),
     ]
+    tables, boxes = [], []
+    if len(frame):
+        p = "Listed by" if few else "p:"
+        caption = f"Against a chain of order n - 2. {p} Fisher's exact test, corrected for all (Holm)."
+        tables = [table(frame, _without_p(columns, few), caption)]
+        alt = "Over-represented sequences: " + "; ".join(frame["sequence"][:5])
+        boxes = [FigureBox(figures.motif_figure(frame), "Times as often as expected.", alt, "motifs")]
     return Part(Section("Over-represented sequences", text, tables, boxes), {"motifs": frame})
 
 

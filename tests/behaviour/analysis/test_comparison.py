@@ -181,15 +181,10 @@ def test_a_single_plan_is_cut_in_parts(length, group):
     torch.testing.assert_close(score("it", prior, plans).bits, want)
 
 
-@pytest.mark.parametrize("lengths", [[0, 0], [1, 0]])
+@pytest.mark.parametrize("lengths", [[], [0, 0], [1, 0]])
 def test_fewer_than_two_actions_are_refused(lengths):
     with refuses("two held-out actions"):
-        score("it", UniformPrior(3), Plans(torch.zeros(2, 4).long(), 3, torch.tensor(lengths)))
-
-
-def test_no_plans_are_refused():
-    with refuses("two held-out actions"):
-        score("it", UniformPrior(3), Plans(torch.zeros(0, 4).long(), 3))
+        score("it", UniformPrior(3), Plans(torch.zeros(len(lengths), 4).long(), 3, torch.tensor(lengths).long()))
 
 
 @pytest.mark.parametrize("group", [None, torch.arange(12) // 3 * 5])
@@ -214,10 +209,10 @@ def test_score_of_bits_with_a_mask(group):
     torch.testing.assert_close(again.bits, score("it", prior, plans).bits)
     mask[:, :] = False
     mask[0, 3] = True
-    with refuses("two held-out actions", "not 1"):
+    with refuses("two held-out actions", "got 1"):
         score_bits("it", "actions", surprisal, plans, mask)
     for wrong in (~plans.mask(), plans.mask().long(), plans.mask()[:1]):
-        with refuses("mask: bool", "behind the end of a plan"):
+        with refuses("`mask` must be bool", "behind the end of a plan"):
             score_bits("it", "actions", surprisal, plans, wrong)
 
 
@@ -231,7 +226,7 @@ def test_minus_is_paired():
     others = replace(plans, actions=(plans.actions + 1) % 3)  # of equal lengths
     for other in (held_out()[:9], held_out(group=torch.arange(12) // 4), held_out().with_end(), others):
         one = score("other", UniformPrior(other.num_actions), other)
-        with refuses("MarkovPrior, UniformPrior", "scores on the same plans"):
+        with refuses("MarkovPrior and UniformPrior must be scored on the same plans"):
             markov.minus(replace(one, model="UniformPrior"))
 
 

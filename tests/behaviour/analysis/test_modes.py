@@ -9,7 +9,6 @@ import torch
 
 from neuroprior import Plans
 from neuroprior.behaviour import (
-    ModeChoice,
     choose_modes,
     mode_frame,
     mode_plans,
@@ -161,20 +160,20 @@ def test_the_table_says_what_each_mode_does():
     assert table.loc["walk", "enters"] == "hill 1.00"
 
 
-def test_wrong_arguments_are_named():
-    plans, _ = source(6, 10, seed=1)
-    with refuses("num_modes"):
-        choose_modes(plans, [])
-    with refuses("num_modes"):
-        choose_modes(plans, [0, 1])
-    with refuses("folds"):
-        choose_modes(plans, [1], number_of_folds=7)
-    with refuses("order"):
-        choose_modes(plans, [1], order=-1)
-    for mask in (torch.ones(2, dtype=torch.bool), torch.ones_like(plans.actions)):
-        with pytest.raises(ValueError, match=r"mask: bool \[\d+, \d+\], as the actions, is expected"):
-            choose_modes(plans, [1], mask=mask)
-    assert isinstance(choose_modes(plans, [1], number_of_folds=2, generator=seeded(0)), ModeChoice)
+@pytest.mark.parametrize(
+    ("numbers", "options", "words"),
+    [
+        ([], {}, "`num_modes` must not be empty"),
+        ([0, 1], {}, "num_modes"),
+        ([1], {"number_of_folds": 7}, "folds"),
+        ([1], {"order": -1}, "order"),
+        ([1], {"mask": torch.ones(2, dtype=torch.bool)}, "`mask` must be bool of shape [6, 10]"),
+        ([1], {"mask": torch.ones(6, 10, dtype=torch.long)}, "`mask` must be bool of shape [6, 10]"),
+    ],
+)
+def test_wrong_arguments_are_named(numbers, options, words):
+    with refuses(words):
+        choose_modes(source(6, 10, seed=1)[0], numbers, **options)
 
 
 def test_transitions_of_modes_are_expected_counts():

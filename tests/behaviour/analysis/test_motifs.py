@@ -237,22 +237,6 @@ def test_codes_do_not_overflow():
     assert counts == {(40, 51): (50, 25), (1, 2): (50, 25), (40, 2): (0, 25), (1, 51): (0, 25)}
 
 
-def test_repeats_are_merged():
-    """Within plans, never across; runs of one action then do not come first."""
-    probs = markov_probs(4, 2, 0, 1.5)
-    probs[torch.arange(16), torch.arange(16) % 4] = 0
-    alone = markov_plans(probs, 60, 12, 1).actions[:, 1:]
-    assert (alone[1:, 0] == alone[:-1, -1]).sum() > 10  # plans that begin as the one before them ended
-    plans = Plans(alone.repeat_interleave(torch.arange(11) % 3 + 1, 1), 4)
-    found = motifs(plans, (3, 4), collapse_repeats=True)
-    assert found == motifs(Plans(alone, 4), (3, 4))
-    assert len(found) > 20
-    chain = markov_plans(markov_probs(3, 1, 0), 20, 60, 0)
-    again = Plans(chain.actions.repeat_interleave(torch.arange(60) % 3 + 1, 1), 3)
-    assert any(m.corrected <= 0.05 for m in motifs(again, (3, 4)))
-    assert {len(set(m.actions[i : i + 2])) for m in motifs(again, collapse_repeats=True) for i in range(2)} == {2}
-
-
 def test_the_order_of_the_list():
     found = motifs(planted(4, (0, 1, 2, 3, 0), 0))
     kinds = [2 if m.corrected > 0.05 else int(m.ratio < 1) for m in found]
@@ -288,15 +272,12 @@ def test_chunks_change_nothing(monkeypatch):
 )
 def test_nothing_to_test(plans):
     assert motifs(plans) == []
-    assert motifs(plans, collapse_repeats=True) == []
 
 
 def test_bad_input():
     plans = planted(4, (0, 1, 2), 0)
     with refuses("`lengths` must be at least 2, got 1"):
         motifs(plans, (3, 1))
-    with refuses("`lengths` must be at least 3 with collapse_repeats, got 2"):
-        motifs(plans, (2, 3), collapse_repeats=True)
     with refuses("lengths", "[3, 3]"):
         motifs(plans, (3, 3))
     with refuses("lengths", "[]"):

@@ -266,28 +266,3 @@ def test_a_damaged_result_is_named(tmp_path):
         run.path(job).write_bytes(content)
         with refuses("fold0-counts.npz", "damaged"):
             run.do([job], processes=1)
-
-
-def test_the_reference_is_the_best_model_wherever_it_stands(tmp_path):
-    """Of a chain of order 1 the best is not the last of the table; differences are from it."""
-    found = evaluated(chain(60, 12), tmp_path)
-    costs = [model.cost for model in found.models]
-    assert costs.index(min(costs)) not in (0, len(costs) - 1)
-    assert found.reference[0] is found.models[costs.index(min(costs))] is found.best
-    table = found.table()
-    assert table["more"].tolist() == pytest.approx([cost - min(costs) for cost in costs])
-    assert found.reference[1] == f"{table['model'][costs.index(min(costs))]} (actions)"
-
-
-def test_a_gain_is_over_one_action_less(tmp_path):
-    """At each lag: the bits with all nearer actions known less those with this one as well, on the same actions."""
-    plans, design = chain(60, 12), Design(2, max_steps=STEPS, reach=3)
-    todo = jobs(design, ["counts", "lags"], [ACTIONS])
-    results = cross_validation(tmp_path, plans, None, design).do(todo, processes=1)
-    arrays = results[[job.kind for job in todo].index("lags")]
-    bits, actions = (arrays[f"markov/{what}"].sum(1) for what in ("bits", "actions"))
-    gains = evaluate(plans, None, design, todo, results).gains
-    assert gains["lag"].tolist() == [1, 2, 3]
-    assert gains["bits"].tolist() == pytest.approx(((bits[:-1] - bits[1:]) / actions[1:]).tolist())
-    assert gains["units"].tolist() == [arrays["markov/bits"].shape[1]] * 3
-    assert ((gains["low"] < gains["bits"]) & (gains["bits"] < gains["high"])).all()

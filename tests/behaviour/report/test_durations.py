@@ -197,12 +197,6 @@ def test_few_units_give_no_verdict():
     assert "*" not in "".join(cell for table in made.tables for row in table.rows for cell in row)
 
 
-def test_one_plan_is_cut_in_time():
-    plans = timed(True, 1, 600)
-    frame = tables(replace(plans, group=None))["next_by_duration"]
-    assert frame.iloc[0]["low"] > 0
-
-
 def test_without_durations_there_is_no_section():
     plans = timed(False)
     for durations in (None, torch.full_like(plans.durations, nan), torch.zeros_like(plans.durations)):
@@ -219,9 +213,9 @@ def test_networks_with_durations():
     assert bits["actions and durations"] < bits["actions"] - 0.1
     row = made.tables["next_by_duration"].set_index("model").loc["gru"]
     assert row["gain"] == pytest.approx(bits["actions"] - bits["actions and durations"])
-    with refuses("no durations"):
+    with refuses("`inputs` must not hold durations"):
         report(replace(plans, durations=None), fits=replace(QUICK_IN_TWO, inputs=["durations"]))
-    with refuses("durations are an input of combined, transformer, gru"):
+    with refuses("`models` must hold one of combined, transformer, gru"):
         report(plans, fits=replace(QUICK_IN_TWO, inputs=["durations"]), sections=["durations"])
 
 
@@ -245,9 +239,10 @@ def test_rounded_durations_have_no_empty_bins():
 
 
 def test_the_parts_of_a_single_plan_are_its_units():
-    frames = tables(replace(timed(False, 1, 600), group=None))
+    frames = tables(replace(timed(True, 1, 600), group=None))
     for name in ("duration_laws", "next_by_duration"):
         assert frames[name]["units"].tolist() == [BLOCKS] * len(frames[name])
+    assert frames["next_by_duration"].iloc[0]["low"] > 0
 
 
 def test_gains_are_those_of_durations_above_0():

@@ -240,9 +240,9 @@ def test_a_page_leaves_the_settings_of_other_figures_alone():
 
 def test_tables():
     assert Table(["a", "b", "c"], [["1", "2", "3"]]).align == "lrr"
-    with pytest.raises(ValueError, match=r"rows\[1\]: 2 cells are expected, one a heading, not 3"):
+    with pytest.raises(ValueError, match=r"`rows\[1\]` must have 2 cells, one a heading, got 3"):
         Table(["a", "b"], [["1", "2"], ["1", "2", "3"]])
-    with pytest.raises(ValueError, match="align: 2 letters l or r are expected, not 'lx'"):
+    with pytest.raises(ValueError, match="`align` must be 2 letters l or r, got 'lx'"):
         Table(["a", "b"], [], align="lx")
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from neuroprior import Plans, write_plans
+from neuroprior import Plans
 from neuroprior.behaviour.report import plan_report
 from neuroprior.behaviour.report.document import Document
 from neuroprior.behaviour.report.options import FitOptions, ReadOptions
@@ -162,11 +162,3 @@ def test_options_of_files_reach_the_reader(tmp_path):
     assert merged["actions"] < plain["actions"] == gap["actions"] == 95
     labelled = facts(4, missing="label")
     assert (labelled["actions"], labelled["kinds of actions"]) == (96, 4)
-
-
-def test_plans_in_memory_are_those_of_their_file(tmp_path):
-    plans = chain(context=torch.arange(12) % 2, group=torch.arange(12) % 4)
-    write_plans(plans, tmp_path / "plans.npz")
-    one, two = (report(given, **IN_TWO) for given in (plans, tmp_path / "plans.npz"))
-    assert one.frames["plans"].equals(two.frames["plans"])
-    assert (one.title, two.title) == ("Plans", "Plans in plans.npz")

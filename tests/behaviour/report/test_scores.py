@@ -15,7 +15,6 @@ from neuroprior.behaviour.report.scores import (
     Model,
     evaluate,
     evaluate_saved,
-    jobs,
     load_arrays,
     save_arrays,
 )
@@ -68,14 +67,6 @@ def test_there_is_no_difference_between_scores_of_other_actions():
     assert first["more"] == 0
     assert pd.isna(second["more"])
     assert second["bits_per_action"] == pytest.approx(1)
-
-
-def test_jobs_are_the_slowest_first():
-    made = [str(job) for job in jobs(Design(2), ["counts", "gru", "lags"], [ACTIONS, DURATIONS])]
-    gru = ["fold0-gru-durations", "fold0-gru", "fold1-gru-durations", "fold1-gru"]
-    assert made == [*gru, "fold0-lags", "fold0-counts", "fold1-counts"]
-    combined = jobs(Design(1), ["combined", "gru", "stacked", "transformer", "counts"], [ACTIONS])
-    assert [job.kind for job in combined] == ["combined", "transformer", "counts"]
 
 
 def results(*named: tuple[str, str], number: int, bits: float) -> dict[str, np.ndarray]:

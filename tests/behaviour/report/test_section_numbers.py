@@ -162,7 +162,7 @@ def test_transitions_are_counted_in_each_group(plans, found):
 
 @pytest.fixture(scope="module")
 def worded() -> Plans:
-    """Words with long runs, among noise."""
+    """Words among noise."""
     words = torch.tensor([[0, 0, 0, 1, 1, 2], [3, 3, 1, 1, 1, 0], [2, 2, 3, 0, 0, 3]])
     plans = words[torch.randint(3, (34, 4), generator=seeded(0))].flatten(1)
     wild = torch.rand(plans.shape, generator=seeded(1)) < 0.25
@@ -170,19 +170,16 @@ def worded() -> Plans:
     return Plans(actions, 4, action_names=list("abcd"), group=torch.arange(34) % 6)
 
 
-def test_sequences_with_repeats_kept_and_merged(worded):
+def test_over_represented_sequences(worded):
     part = motif_section(evaluate_saved({"uniform": UniformPrior(4)}, worded, 0))
-    frame = part.frames["motifs"]
-    for repeats, merged in (("kept", False), ("merged", True)):
-        every = motifs(worded, top=12, collapse_repeats=merged)
-        want = [one for one in every if one.corrected < 0.05]
-        assert len([one for one in every if one.p_value < 0.05]) > len(want) > 0
-        own = frame[frame["repeats"] == repeats]
-        assert own["sequence"].tolist() == [" ".join("abcd"[a] for a in one.actions) for one in want]
-        for name in ("count", "expected", "ratio", "low", "high", "p_value", "corrected"):
-            assert own[name].tolist() == [getattr(one, name) for one in want]
-        first = [own["sequence"].iloc[0], f"{own['count'].iloc[0]:,}", f"{own['expected'].iloc[0]:,.1f}"]
-        assert cells(part, merged)[0][:3] == first
+    frame, every = part.frames["motifs"], motifs(worded, top=12)
+    want = [one for one in every if one.corrected < 0.05]
+    assert len([one for one in every if one.p_value < 0.05]) > len(want) > 0
+    assert frame["sequence"].tolist() == [" ".join("abcd"[a] for a in one.actions) for one in want]
+    for name in ("count", "expected", "ratio", "low", "high", "p_value", "corrected"):
+        assert frame[name].tolist() == [getattr(one, name) for one in want]
+    first = frame.iloc[0]
+    assert cells(part)[0][:3] == [first["sequence"], f"{first['count']:,}", f"{first['expected']:,.1f}"]
 
 
 def test_drift_within_plans_between_them_and_between_groups(plans, found):

@@ -10,20 +10,17 @@ import torch
 from matplotlib.figure import Figure
 
 from neuroprior.behaviour.report.document import Document
-from neuroprior.behaviour.report.fits import counted
 from neuroprior.behaviour.report.options import FitOptions, ReadOptions
 from neuroprior.behaviour.report.page import FigureBox
 from neuroprior.behaviour.report.plan_report import report
 from neuroprior.behaviour.report.scores import evaluate_saved
 from neuroprior.behaviour.report.sections import (
     SECTIONS,
-    action_frame,
     drift_section,
     lag_section,
-    motif_section,
 )
 from neuroprior.plans import Plans
-from neuroprior.priors import MarkovPrior, UniformPrior
+from neuroprior.priors import UniformPrior
 from tests.support.chains import markov_plans, markov_probs
 from tests.support.reports import QUICK_IN_TWO
 from tests.support.sources import refuses, seeded
@@ -31,15 +28,6 @@ from tests.support.sources import refuses, seeded
 
 def found_in(plans: Plans):
     return evaluate_saved({"uniform": UniformPrior(plans.num_actions)}, plans, 0)
-
-
-@pytest.mark.parametrize(("often", "beyond", "repeats"), [(4, 0, {"kept"}), (2, 1, {"kept", "merged"})])
-def test_repeats_are_of_actions_that_were_taken(often, beyond, repeats):
-    """Every so-many-th word has a repeat: 18 or 21 % of all pairs; what stands beyond the ends is none of them."""
-    word = (torch.arange(800).view(400, 2) * 7 // 3 % often == 0).long()
-    actions = torch.tensor([[0, 1, 2, 0], [3, 2, 2, 0]])[word].flatten(1)
-    plans = Plans(torch.nn.functional.pad(actions, (0, 3), value=beyond), 4, torch.full((400,), 8))
-    assert set(motif_section(found_in(plans)).frames["motifs"]["repeats"]) == repeats
 
 
 def test_gains_are_starred_where_their_interval_is_above_0():
@@ -107,25 +95,6 @@ def test_what_is_asked_for_is_done(made):
     assert made.settings | asked == made.settings
 
 
-def test_actions_are_counted_by_plan():
-    plans = Plans(torch.tensor([[2, 2, 1], [2, 0, 0]]), 3, durations=torch.tensor([[1.0, 5, 2], [3, 4, 8]]))
-    frame = action_frame(plans)
-    assert frame[["action", "count", "plans", "median_duration"]].to_numpy().tolist() == [
-        ["2", 3, 2, 3.0],
-        ["0", 2, 1, 6.0],
-        ["1", 1, 1, 2.0],
-    ]
-    assert frame["share"].tolist() == pytest.approx([1 / 2, 1 / 3, 1 / 6])  # of all actions
-
-
-def test_bits_are_shown_as_nats_and_perplexities_too(made):
-    table = made.tables["plans"]
-    for bits, end in (("bits_per_action", ""), ("low", "_low"), ("high", "_high")):
-        assert table["nats" + (end or "_per_action")].tolist() == pytest.approx((table[bits] * math.log(2)).tolist())
-        assert table[f"perplexity{end}"].tolist() == pytest.approx((2 ** table[bits]).tolist())
-    assert table["perplexity"][0] == pytest.approx(3)  # of the uniform prior
-
-
 def test_the_lead_names_the_best_model(made):
     best = made.tables["plans"].sort_values("bits_per_action").iloc[0]
     assert made.lead == (
@@ -143,17 +112,6 @@ def test_plans_in_memory_and_in_a_file_have_the_same_report(tmp_path, made):
     pd.testing.assert_frame_equal(again.tables["plans"], made.tables["plans"])
     assert (made.title, again.title) == ("Plans", "Plans in plans.npz")
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.html", "results.json", "plans.csv", "folds"}
-
-
-@pytest.mark.parametrize("skip", [0, 3])
-def test_priors_by_name_are_scored(skip):
-    plans = markov_plans(markov_probs(3, 1, 0, 1.5), 24, 8, 1)
-    chain = MarkovPrior(3, 1).fit(plans)
-    made = report(plans, priors={"mine": chain, "none": UniformPrior(3)}, skip=skip, sections=["scores"])
-    scores = made.tables["plans"]
-    assert scores["model"].tolist() == ["mine", "none"]
-    bits = -chain.action_log_probs(plans)[:, skip:].sum() / torch.tensor(2.0).log() / counted(plans, skip).sum()
-    assert scores["bits_per_action"][0] == pytest.approx(float(bits), abs=1e-5)
 
 
 PLANS = markov_plans(markov_probs(3, 1, 0), 8, 5, 1)

@@ -222,7 +222,7 @@ def test_the_optimum_is_drawn_where_it_is_near():
     ],
 )
 def test_nothing_to_draw_is_an_error(make):
-    with pytest.raises(ValueError, match="at least one is expected"):
+    with pytest.raises(ValueError, match="must not be empty"):
         make()
 
 
