@@ -29,7 +29,7 @@ from neuroprior.behaviour.analysis.drift import (
     by_plan,
     by_position,
 )
-from neuroprior.behaviour.analysis.lags import LagInformation, mutual_information, pieces
+from neuroprior.behaviour.analysis.lags import LagInformation, mutual_information
 from neuroprior.behaviour.analysis.modes import (
     ModeChoice,
     choose_modes,
@@ -98,7 +98,6 @@ __all__ = [
     "motifs",
     "mutual_information",
     "paired_difference",
-    "pieces",
     "ratio_difference",
     "score",
     "score_bits",

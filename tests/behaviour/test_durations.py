@@ -129,17 +129,6 @@ def test_a_model_is_saved_alone(tmp_path):
         load(tmp_path, kind=DurationModel)
 
 
-@pytest.mark.parametrize("law", TRUE)
-def test_laws_are_chosen_as_by_fits_without_each_part(law):
-    plans = of_one_action(draw(law, 300), 10)
-    (chosen,) = DurationModel(1, list(TRUE)).fit(plans).table()
-    scores = {name: -2.0 * (1 if name == "exponential" else 2) for name in TRUE}
-    for learned, left_out in folds(plans, 5):
-        for name in scores:
-            scores[name] += float(DurationModel(1, [name]).fit(plans[learned]).log_prob(plans[left_out]).sum())
-    assert chosen.law == max(scores, key=scores.get)
-
-
 def test_unknown_durations_are_left_out():
     times = draw("gamma", 1000).view(10, 100)
     missing = torch.rand(10, 100, generator=seeded(0)) < 0.3

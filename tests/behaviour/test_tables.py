@@ -131,7 +131,7 @@ READ: list[tuple[str, dict[str, Any], list[list[Any]], list[list[Any]] | None, l
         )
         for rows in (OVERLAPPING, OVERLAPPING[::-1])
     ),
-    ("action,kind,start\na,START,0:10:05\na,STOP,0:10:07.5\n", KIND, [["a"]], [[2.5]], []),
+    ("action,kind,start\na,start,0:10:05\na,Stop,0:10:07.5\n", KIND, [["a"]], [[2.5]], []),
     # options
     (OPTIONED, {}, [["a", "b"], ["c", "c"]], [[1, 1], [1, 0.5]], []),
     (OPTIONED, {"max_gap": 0}, [["a", "b"], ["c"], ["c"]], None, []),

@@ -183,17 +183,12 @@ def pieces(plans: Plans, length: int, most: int, generator: torch.Generator | No
         generator: draws them.
 
     Returns:
-        The pieces, in the order of the plans. A context per step is cut likewise, one per plan repeated. Their `group`
+        The pieces, in the order of the plans. A context per step is cut likewise. Their `group`
         is the independent unit (see `neuroprior.behaviour.units`): the group of the plan; or the number of the plan, if
         fewer than two groups have pieces; or one of `BLOCKS` consecutive parts, if only one plan has any.
 
     Raises:
         ValueError: no plan has that many actions, or `length` or `most` is below 1.
-
-    Example:
-        >>> plans = Plans(torch.arange(40)[None] % 4, 4)
-        >>> pieces(plans, length=5, most=3, generator=torch.Generator().manual_seed(0)).actions.shape
-        torch.Size([3, 5])
     """
     check_sizes(length=length, most=most)
     start_here = torch.zeros_like(plans.mask())

@@ -95,20 +95,6 @@ def test_intervals_of_ratios_cover_at_their_level():
     assert low <= hits <= stats.binom.isf(FALSE_ALARM / 2, 2000, 0.965)
 
 
-def test_scores_cover_at_their_level():
-    """400 samples of plans of 1 to 8 independent actions, whose bits are a cross entropy: as above."""
-    prior = MarkovPrior(2, 0, backoff="dirichlet").fit(torch.tensor([[0, 0, 0, 1]]))
-    p = prior(torch.zeros(1, 1).long()).softmax(-1)[0, 0].double()
-    truth = float(-(0.6 * p[0].log2() + 0.4 * p[1].log2()))
-    generator, hits = seeded(1), 0
-    for _ in range(400):
-        actions = (torch.rand(60, 8, generator=generator) < 0.4).long()
-        found = score("m", prior, Plans(actions, 2, torch.randint(1, 9, (60,), generator=generator))).bits_per_action()
-        hits += found.low <= truth <= found.high
-    low = stats.binom.ppf(FALSE_ALARM / 2, 400, 0.925)
-    assert low <= hits <= stats.binom.isf(FALSE_ALARM / 2, 400, 0.965)
-
-
 def held_out(**more) -> Plans:
     """12 plans of up to 7 actions, of 3 actions; the third and fourth have none."""
     lengths = torch.tensor([7, 3, 0, 0, 5, 1, 2, 6, 4, 7, 3, 2])
@@ -280,17 +266,6 @@ def test_each_baseline_is_the_best_of_what_was_tried(num_contexts):
     assert found[-1].validation_bits == pytest.approx(min(bits(t, validation) for t in trees), abs=1e-6)
     assert isinstance(tree, ContextTreePrior)
     assert found[-1].how == f"depth {DEPTH}"
-
-
-@pytest.mark.parametrize("matters", [True, False])
-def test_context_is_taken_where_it_helps(matters):
-    training, validation = sources(matters), sources(matters, 200, seed=7)
-    if not matters:  # many contexts, so that what is lost by counting them apart is not random
-        training, validation = (replace(p, context=torch.arange(len(p)) % 20) for p in (training, validation))
-    for baseline in baselines(training, validation, 20):
-        if baseline.model in ("markov-1", "markov-2", "context tree"):
-            inputs = score(baseline.model, baseline.prior, validation).inputs
-            assert ("context" in inputs) == matters, baseline.model
 
 
 def test_contexts_that_only_held_out_plans_have():

@@ -6,7 +6,6 @@ import sys
 from collections import Counter
 from dataclasses import astuple
 
-import numpy as np
 import pytest
 import torch
 from scipy import stats
@@ -274,20 +273,16 @@ def test_nothing_to_test(plans):
     assert motifs(plans) == []
 
 
-def test_bad_input():
-    plans = planted(4, (0, 1, 2), 0)
-    with refuses("`lengths` must be at least 2, got 1"):
-        motifs(plans, (3, 1))
-    with refuses("lengths", "[3, 3]"):
-        motifs(plans, (3, 3))
-    with refuses("lengths", "[]"):
-        motifs(plans, ())
-    with refuses("top", "0"):
-        motifs(plans, top=0)
-
-
-def test_lengths_are_a_list():
-    plans = Plans(torch.arange(60).view(6, 10) % 3, 3)
-    assert motifs(plans, lengths=np.array([3])) == motifs(plans, lengths=[3])
-    with refuses("lengths: a list of numbers is expected, not 3"):
-        motifs(plans, lengths=3)
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"lengths": (3, 1)}, "`lengths` must be at least 2, got 1"),
+        ({"lengths": (3, 3)}, "`lengths` must be different integers, one or more, got [3, 3]"),
+        ({"lengths": ()}, "`lengths` must be different integers, one or more, got []"),
+        ({"lengths": 3}, "lengths"),
+        ({"top": 0}, "top"),
+    ],
+)
+def test_what_is_refused(options, words):
+    with refuses(words):
+        motifs(planted(4, (0, 1, 2), 0), **options)

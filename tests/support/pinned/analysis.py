@@ -17,10 +17,10 @@ from neuroprior.behaviour import (
     mode_frame,
     mode_plans,
     mode_table,
-    pieces,
     score,
     score_bits,
 )
+from neuroprior.behaviour.analysis.lags import pieces
 from neuroprior.behaviour.analysis.modes import mode_transitions
 from neuroprior.priors import ContextTreePrior, MarkovPrior, SwitchingPrior, UniformPrior, forecast, infer
 from neuroprior.worlds import cube, gridworld
