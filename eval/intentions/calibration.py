@@ -16,7 +16,7 @@ class Bin(NamedTuple):
 
 
 def count_forecasts(log_probs: Tensor, outcome: Tensor, bins: int = 10) -> Tensor:
-    """Sort forecasts into bins of equal width (DeGroot and Fienberg 1983, reliability diagrams).
+    """Sorts forecasts into bins of equal width (DeGroot and Fienberg 1983, reliability diagrams).
 
     Args:
         log_probs: `[M, K]`, nats: each of K outcomes is a forecast at each of M places.
@@ -34,7 +34,7 @@ def count_forecasts(log_probs: Tensor, outcome: Tensor, bins: int = 10) -> Tenso
 
 
 def calibration_error(sums: Tensor) -> float:
-    """The absolute difference of forecast and share that came true, averaged over forecasts (Naeini et al. 2015).
+    """Averages the absolute difference of forecast and share that came true over forecasts (Naeini et al. 2015).
 
     Args:
         sums: `[G, bins, 3]`: those of `count_forecasts`, for each of G independent units.
@@ -44,7 +44,7 @@ def calibration_error(sums: Tensor) -> float:
 
 
 def filled_bins(sums: Tensor) -> list[Bin]:
-    """The bins that have forecasts, in ascending order.
+    """Returns the bins that have forecasts, in ascending order.
 
     The interval is that of a ratio over units; a share of 0 or 1, which has no spread, has Wilson's, with units as
     trials. Its ends are NaN where a single unit has any.

@@ -18,25 +18,25 @@ Array = NDArray[np.float64]
 
 
 def interquartile_mean(values: Array) -> Interval:
-    """The mean over the middle half of W worlds: without the int(W / 4) highest, and as many lowest, of each seed."""
+    """Averages over the middle half of W worlds: without the int(W / 4) highest, and as many lowest, of each seed."""
     return mean_interval(stats.trim_mean(values, 0.25, axis=0))
 
 
 def interquartile_gap(first: Array, second: Array) -> Interval:
-    """How much higher the `interquartile_mean` of `first` is than that of `second`, paired by seed."""
+    """Says how much higher the `interquartile_mean` of `first` is than that of `second`, paired by seed."""
     gap = stats.trim_mean(first, 0.25, axis=0) - stats.trim_mean(second, 0.25, axis=0)
     # Rounded, so that differences that are equal but for rounding errors have no spread.
     return mean_interval(np.round(gap, 12))
 
 
 def probability_of_improvement(first: Array, second: Array) -> Interval:
-    """The share of worlds in which `first` is better than `second`; a tie counts one half."""
+    """Returns the share of worlds in which `first` is better than `second`; a tie counts one half."""
     mean, low, high = mean_interval(((first > second) + (first == second) / 2).mean(0))
     return Interval(mean, max(low, 0.0), min(high, 1.0))
 
 
 def mean_intervals(frame: pd.DataFrame, by: str | Sequence[str], value: str) -> pd.DataFrame:
-    """The mean of a column of a table for each group of rows; see `mean_interval`.
+    """Averages a column of a table in each group of rows; see `mean_interval`.
 
     Args:
         frame: a row for each independent unit of each group.

@@ -46,7 +46,7 @@ class ReadOptions:
     action_names: Sequence[str] | None = None
 
     def read(self, file: str) -> Plans:
-        """Read the plans of a file; see `neuroprior.read_plans`."""
+        """Reads the plans of a file; see `neuroprior.read_plans`."""
         return read_plans(file, **vars(self))
 
 
@@ -105,18 +105,18 @@ class FitOptions:
 
     @property
     def kinds(self) -> Sequence[ModelName]:
-        """The models to fit."""
+        """Returns the models to fit."""
         if self.models is not None:
             return self.models
         return QUICK if self.effort == "fast" else MODELS
 
     def changed(self) -> list[str]:
-        """The names of the options that have another value than by default, but for those of the machine."""
+        """Returns the names of the options that have another value than by default, but for those of the machine."""
         named = (field for field in fields(self) if field.name not in ("seed", "processes", "dask"))
         return [field.name for field in named if getattr(self, field.name) != field.default]
 
 
 def check_choices(name: str, given: Sequence[str], known: Sequence[str]) -> None:
-    """Raise ValueError unless all are known, and there is one at least."""
+    """Raises ValueError unless all are known, and there is one at least."""
     if isinstance(given, str) or not given or set(given) - set(known):
         raise ValueError(f"`{name}` must be a list of some of {', '.join(known)}, got {given!r}.")

@@ -275,9 +275,7 @@ def drift_section(found: Evaluation) -> Part | None:
     drift = pd.DataFrame(rows, columns=["what", "name", "bits", "low", "high"])
     own = pd.DataFrame({"group": plans.group.tolist(), "bits": plans.bits.tolist()})
     own = own.assign(index=own.groupby("group").cumcount() + 1)
-    tests: list[dict[str, Any]] = []
-    if within.trend is not None:
-        tests.append({"test": "change over a plan, bits"} | within.trend._asdict())
+    tests: list[dict[str, Any]] = [{"test": "change over a plan, bits"} | within.trend._asdict()]
     if plans.trend is not None:
         tests.append({"test": f"rank correlation from {plans.item[:-1]} to {plans.item[:-1]}"} | plans.trend._asdict())
     if groups.p_value is not None:
@@ -294,19 +292,14 @@ def drift_section(found: Evaluation) -> Part | None:
         *(["The only plan was cut into consecutive parts, which stand for plans."] * bool(found.settings.get("cut"))),
         *([_no_verdict(found.too_few)] if found.too_few else []),
     ]
-    tables = []
-    if tests:
-        columns: Mapping[str, Column] = {
-            "test": "test",
-            "estimate": "mean:+.3f",
-            "95 % interval": lambda row: "" if pd.isna(row["mean"]) else f"{row.low:+.3f} to {row.high:+.3f}",
-            "p": "p_value:.2g",
-        }
-        tables.append(
-            table(
-                tests_frame, _without_p(columns, found.too_few), f"Bits of {model.label}; intervals over {found.unit}."
-            )
-        )
+    columns: Mapping[str, Column] = {
+        "test": "test",
+        "estimate": "mean:+.3f",
+        "95 % interval": lambda row: "" if pd.isna(row["mean"]) else f"{row.low:+.3f} to {row.high:+.3f}",
+        "p": "p_value:.2g",
+    }
+    caption = f"Bits of {model.label}; intervals over {found.unit}."
+    tables = [table(tests_frame, _without_p(columns, found.too_few), caption)]
     caption = f"Bits per action of {model.label}. 95 % intervals over {found.unit}; of groups, over the plans of each."
     box = FigureBox(figures.drift_figure(drift, own), caption, "Bits per action by place, plan and group.", "drift")
     actions = _action_drift(found.plans)
