@@ -22,6 +22,7 @@ from neuroprior import (
     write_plans,
 )
 from neuroprior.__main__ import main
+from neuroprior.behaviour.report import FitOptions, ReadOptions
 from neuroprior.behaviour.report.figures import ethogram_figure
 from neuroprior.behaviour.report.plan_report import report
 from neuroprior.control import ICEMPlanner, PlanarArm, control
@@ -82,10 +83,9 @@ def test_exact_solutions_need_a_table():
         expected_score(world, world.reset(2, seeded(0)), torch.zeros(2, 1, 3, dtype=torch.long))
 
 
-@pytest.mark.parametrize("option", [{"max_gap": 0}, {"max_gap": 0.0}, {"num_actions": 0}, {"merge_repeats": True}])
-def test_options_of_files_are_not_for_plans_in_memory(option):
-    with refuses(next(iter(option)), "for files only"):
-        report(Plans(ACTIONS, 2), models=["counts"], **option)
+def test_options_of_files_are_not_for_plans_in_memory():
+    with refuses("`reading` must be left out"):
+        report(Plans(ACTIONS, 2), reading=ReadOptions())
 
 
 @pytest.mark.parametrize("number", [2.5, float("nan"), None, "3"])
@@ -97,6 +97,7 @@ def test_numbers_of_samples_are_integers(number):
 
 
 PLANS = Plans(torch.tensor([[0, 1, 1], [1, 0, 1]]), 2)
+FITTED = {"a": UniformPrior(2)}
 
 
 @pytest.mark.parametrize(
@@ -125,40 +126,26 @@ PLANS = Plans(torch.tensor([[0, 1, 1], [1, 0, 1]]), 2)
         ),
         (lambda: fit(PLANS, 3), ["prior", "a class", "3"]),
         (lambda: fit(PLANS, None), ["prior", "a class", "None"]),
-        (lambda: CombinedPrior(2, ["gru"]), ["a prior", "'gru'"]),
-        (lambda: MixturePrior(2, [MarkovPrior]), ["a prior", "MarkovPrior"]),
+        (lambda: CombinedPrior(2, ["gru"]), ["a prior is expected", "'gru'"]),
+        (lambda: MixturePrior(2, [MarkovPrior]), ["a prior is expected", "MarkovPrior"]),
         (lambda: learn_macros(ACTIONS, 2), ["plans", "Tensor"]),
         (lambda: folds(None, 2), ["plans", "NoneType"]),
         (lambda: analysis.transitions(ACTIONS), ["plans", "Tensor"]),
         (lambda: analysis.motifs([[0, 1]]), ["plans", "list"]),
-        (lambda: analysis.two_sample_tests(PLANS, None), ["plans", "NoneType"]),
         (lambda: analysis.score("x", None, PLANS), ["prior", "NoneType"]),
         (lambda: analysis.score_bits("x", "actions", torch.zeros(2, 2), PLANS), ["bits", "[2, 3]", "[2, 2]"]),
         (lambda: analysis.score_bits("x", "actions", torch.full((2, 3), torch.nan), PLANS), ["bits", "NaN"]),
         (lambda: analysis.mode_table(MarkovPrior(2), PLANS), ["prior", "SwitchingPrior"]),
-        (lambda: analysis.mean_interval([1.0, np.nan]), ["values[1]", "NaN"]),
-        (lambda: analysis.ratio_difference([1.0, 2.0], [np.nan, 1.0]), ["sizes[0]", "NaN"]),
-        (lambda: analysis.share_interval(1.5, 3), ["successes", "1.5"]),
-        (lambda: analysis.share_interval(4, 3), ["successes", "at most 3"]),
-        (lambda: analysis.share_interval(0, True), ["trials", "True"]),
-        (lambda: analysis.mean_intervals(None, "a", "b"), ["frame", "NoneType"]),
-        (lambda: analysis.mean_intervals(pd.DataFrame({"b": [1.0]}), "a", "b"), ["frame", "no column 'a'"]),
-        (lambda: analysis.best_of(torch.zeros(2, 3), [2]), ["baselines", "[2]"]),
-        (lambda: analysis.best_of(torch.zeros(2, 3), []), ["baselines", "[]"]),
-        (lambda: analysis.best_of(torch.tensor([[0.0, torch.nan]])), ["scores[0, 1]", "NaN"]),
-        (lambda: report(PLANS, models="counts"), ["models", "a list", "['counts']"]),
-        (lambda: report(PLANS, priors=UniformPrior(2)), ["priors", "a dict"]),
-        (
-            lambda: report(PLANS, priors={"a": UniformPrior(2)}, folds=2, models=["counts"], max_steps=3),
-            ["priors", "leave folds, models, max_steps out"],
-        ),
-        (lambda: report(PLANS, priors={"a": UniformPrior(2)}, inputs=["actions"]), ["priors", "leave inputs out"]),
-        (lambda: report(PLANS, priors=[UniformPrior(2)]), ["priors", "a dict"]),
-        (lambda: SamplingPlanner(UniformPrior(2), 2, 4).plan(ARM, torch.zeros(1, 4)), ["numbered", "got PlanarArm"]),
-        (lambda: ExhaustivePlanner(2).plan(PlanarArm, torch.zeros(1, 4)), ["a World", "got the class PlanarArm"]),
+        (lambda: FitOptions(models="counts"), ["`models` must be a list", "'counts'"]),
+        (lambda: report(PLANS, priors=UniformPrior(2)), ["`priors` must be a dict"]),
+        (lambda: report(PLANS, priors=[UniformPrior(2)]), ["`priors` must be a dict"]),
+        (lambda: report(PLANS, priors=FITTED, fits=FitOptions(max_steps=3)), ["`max_steps` must be left out"]),
+        (lambda: report(PLANS, priors=FITTED, fits=FitOptions(inputs=["actions"])), ["`inputs` must be left out"]),
+        (lambda: SamplingPlanner(UniformPrior(2), 2, 4).plan(ARM, torch.zeros(1, 4)), ["numbered", "not PlanarArm"]),
+        (lambda: ExhaustivePlanner(2).plan(PlanarArm, torch.zeros(1, 4)), ["a World", "not the class PlanarArm"]),
         (lambda: ICEMPlanner(2, 4).plan(cube(), torch.zeros(1, 4)), ["a ContinuousWorld", "vectors", "got PocketCube"]),
         (lambda: control(ICEMPlanner(2, 4), None, torch.zeros(1, 4), 2), ["a ContinuousWorld", "got NoneType"]),
-        (lambda: report(PLANS, models=["counts"], folds=3), ["folds: at most 2", "not 3"]),
+        (lambda: report(PLANS, fits=FitOptions(["counts"], folds=3)), ["`folds` must be from 2 to 2", "got 3"]),
     ],
 )
 def test_arguments_of_other_kinds(call, words):

@@ -4,7 +4,6 @@ from functools import partial
 from math import inf, nan
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 
@@ -26,18 +25,10 @@ from neuroprior.agents import Replay
 from neuroprior.behaviour import (
     SemiMarkovPrior,
     choose_modes,
-    interquartile_mean,
-    mean_interval,
-    mean_intervals,
     motifs,
     mutual_information,
-    order_selection,
-    paired_difference,
-    probability_of_improvement,
-    ratio_difference,
-    share_interval,
 )
-from neuroprior.behaviour.report.plan_report import report
+from neuroprior.behaviour.report import FitOptions, report
 from neuroprior.control import ICEMPlanner, MPPIPlanner, NoisePrior, ShootingPlanner, VectorGRU, VectorPlans
 from neuroprior.planners import execute, expected_score, value_iteration
 from neuroprior.plans import all_plans, folds, in_parts
@@ -51,8 +42,6 @@ PLANS = Plans(torch.randint(3, (8, 6), generator=seeded(0)), 3)
 UNIFORM, WORLD, STATE = UniformPrior(4), gridworld(4, 4), torch.tensor([0, 5])
 ENDS = [-1.0], [1.0]
 VECTORS = VectorPlans(torch.zeros(2, 5, 1), *ENDS)
-VALUES, MATRIX = [0.1, 0.4, 0.3, 0.8], np.arange(12.0).reshape(3, 4)
-FRAME = pd.DataFrame({"world": list("aabb"), "value": VALUES})
 NONE_OF_THEM = [nan, True, "1"]
 """What is no number in any range."""
 
@@ -99,19 +88,9 @@ SHARES = {
         partial(value_iteration, WORLD),
     ],
 }
-LEVELS = [
-    partial(mean_interval, VALUES),
-    partial(paired_difference, VALUES, VALUES[::-1]),
-    partial(ratio_difference, VALUES, [1, 2, 3, 4]),
-    partial(interquartile_mean, MATRIX),
-    partial(probability_of_improvement, MATRIX, MATRIX + 1),
-    partial(share_interval, 3, 9),
-    partial(mean_intervals, FRAME, "world", "value"),
-]
 ORDERS = {
     "order": [partial(MarkovPrior, 3), partial(SwitchingPrior, 3, 2)],
     "depth": [partial(ContextTreePrior, 3)],
-    "max_order": [partial(order_selection, PLANS)],
     "skip": [partial(mutual_information, PLANS, 2)],
     "first": [PLANS.steps, VECTORS.steps],
     "stop": [partial(VECTORS.steps, 1)],
@@ -156,7 +135,6 @@ def every(arguments, wrong):
         *every(SHARES, [*NONE_OF_THEM, -0.1, 1.5, inf]),
         *every(ORDERS, [*NONE_OF_THEM, 1.0, -1]),
         *every(SIZES, [*NONE_OF_THEM, 1.5, -1, 2**62, 2**70]),
-        *every({"level": LEVELS}, [*NONE_OF_THEM, 0, 1, 2, -0.5, inf, None]),
         *every(
             {"seed": [partial(GRUPrior, 3), gridworld, maze, partial(folds, PLANS, 2)]}, [*NONE_OF_THEM, 1.0, 2**70]
         ),
@@ -174,7 +152,7 @@ def test_numbers_of_folds(number):
     with refuses("folds"):
         choose_modes(PLANS, (1,), number_of_folds=number, max_iterations=1)
     with refuses("folds"):
-        report(PLANS, models=["counts"], folds=number)
+        report(PLANS, fits=FitOptions(["counts"], folds=number))
     if number != 1:
         with refuses("number" if number != 9 else "at least 9 actions"):
             in_parts(PLANS[:1], number)
@@ -195,6 +173,5 @@ def test_what_is_in_range_is_taken():
     assert SamplingPlanner(UNIFORM, 2, 2, uniform_share=1).uniform_share == 1
     assert GRUPrior(3, hidden_size=4, dropout=0).dropout == 0
     assert SamplingPlanner(UNIFORM, 2, 2, objective="return", discount=1).discount == 1
-    assert mean_interval(VALUES, np.float64(0.5)).low < mean_interval(VALUES).mean
     assert all_plans(2, 0).shape == (1, 0)
     assert all_plans(1, 200).shape == (1, 200)

@@ -8,7 +8,7 @@ import torch
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, SamplingPlanner, UniformPrior
 from neuroprior.agents import Agent, Replay
-from neuroprior.behaviour import SemiMarkovPrior, two_sample_tests
+from neuroprior.behaviour import SemiMarkovPrior
 from neuroprior.control import (
     DoubleIntegrator,
     NoisePrior,
@@ -56,7 +56,6 @@ def chains(*others: Prior) -> MixturePrior:
 USES = {
     "scored": lambda plans: learned(PLANS).log_prob(plans),
     "in a world": lambda plans: sample_in_world(learned(plans), WORLD, torch.tensor([0]), 2, 3),
-    "compared": lambda plans: two_sample_tests(PLANS, plans, permutations=9),
     "stored": stored,
     "mixed": lambda plans: MixturePrior(4, [learned(PLANS), UniformPrior(4), learned(plans)]),
     "mixed in a world": lambda plans: sample_in_world(mixture(plans), WORLD, torch.tensor([0]), 2, 3),

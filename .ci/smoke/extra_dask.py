@@ -3,11 +3,12 @@
 from distributed import LocalCluster
 
 from neuroprior import MarkovPrior, Plans, UniformPrior
-from neuroprior.behaviour.report.plan_report import report
+from neuroprior.behaviour.report import FitOptions, report
 
 if __name__ == "__main__":
     plans = Plans(MarkovPrior(3, 1).sample(40, 20), 3)
     with LocalCluster(n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster:
-        models = report(plans, models=["counts"], sections=["scores"], dask=cluster.scheduler_address, out="report")
+        fits = FitOptions(["counts"], dask=cluster.scheduler_address)
+        models = report(plans, fits=fits, sections=["scores"], out="report")
     assert len(models.tables["plans"])
     assert UniformPrior

@@ -3,9 +3,9 @@
 from pathlib import Path
 
 from neuroprior import Plans
-from neuroprior.behaviour.report.plan_report import report
+from neuroprior.behaviour.report import FitOptions, report
 from neuroprior.behaviour.study import simulated_study
 
 names = {"action": "behaviour", "plan": "session", "group": "animal"}
-report(Plans.from_dataframe(simulated_study(0), **names), models=["counts"], processes=1, out="report")
+report(Plans.from_dataframe(simulated_study(0), **names), fits=FitOptions(["counts"], processes=1), out="report")
 assert "<svg" in Path("report/report.html").read_text(encoding="utf-8")

@@ -110,7 +110,6 @@ def curriculum_document(results: Sequence[Mapping[str, Any]], settings: Mapping[
         command,
         {"words": [lead]},
         keys={"curriculum": "rows"},
-        former_names=runs.FORMER_NAMES,
     )
 
 

@@ -172,7 +172,7 @@ def planner_document(
     lead = runs.significance(gaps, f"Normalised scores against {baseline}")
     sections = [Section("Normalised score against model steps", figures=boxes), Section("Tables", tables=tables)]
     frames = {"rows": rows, "paired": gaps, "across": across}
-    return Document(title, lead, sections, frames, settings, command, {"words": [lead]}, former_names=runs.FORMER_NAMES)
+    return Document(title, lead, sections, frames, settings, command, {"words": [lead]})
 
 
 def planner_pairs(frame: pd.DataFrame, baseline: str) -> pd.DataFrame:

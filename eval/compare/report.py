@@ -10,10 +10,10 @@ import pandas as pd
 from eval.compare import figures
 from eval.compare.figures import POINTS, Style
 from eval.compare.results import AGAINST, BEST, Results, grouped, kind_of
-from eval.worlds.runs import FORMER_NAMES, across_table, plus_minus, table_by
+from eval.worlds.runs import across_table, plus_minus, table_by
 from neuroprior.behaviour.report.document import Column, Document, table
 from neuroprior.behaviour.report.figures import transition_figure
-from neuroprior.behaviour.report.page import FigureBox, Section, Table, breakable
+from neuroprior.behaviour.report.page import FigureBox, Section, Table
 
 FRAMES = {name: name for name in ("rows", "paired", "efficiency", "bits", "words", "reasons", "across", "combined")}
 FRAMES |= {"growth": "curriculum"}
@@ -54,6 +54,11 @@ TRANSITIONS = (
 )
 
 
+def breakable(name: str) -> str:
+    """A long name, which may be broken where its words end."""
+    return name.replace("_", "_\N{ZERO WIDTH SPACE}")
+
+
 def document(results: Results, settings: Mapping[str, Any], command: str) -> Document:
     """All that is printed and written of a comparison; the same results and settings give the same document.
 
@@ -92,7 +97,6 @@ def document(results: Results, settings: Mapping[str, Any], command: str) -> Doc
         {file: getattr(results, name) for file, name in FRAMES.items()},
         settings,
         command,
-        former_names=FORMER_NAMES,
     )
 
 

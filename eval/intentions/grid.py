@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from eval.intentions.calibration import count_forecasts
 from eval.worlds.labyrinth import data_digest
 from neuroprior import MarkovPrior, Plans, Prior, TabularWorld
 from neuroprior._random import draw_seed
-from neuroprior.behaviour.analysis.calibration import reliability
 from neuroprior.planners import value_iteration
 from neuroprior.priors import forecast, infer
 from neuroprior.priors.counts import Chains
@@ -227,8 +227,7 @@ def grid_entries(world: str, settings: IntentionSettings, generator: torch.Gener
         there, time = (seen.length[:, None] >= torch.tensor(settings.observed)).nonzero().T
         if len(there):
             now = logits[there, torch.tensor(settings.observed)[time]].log_softmax(-1)
-            sums = reliability(now, seen.goal[there], torch.zeros_like(there)).sums.sum(0)
-            yield named | {"measure": "calibration", "sums": sums.tolist()}
+            yield named | {"measure": "calibration", "sums": count_forecasts(now, seen.goal[there]).tolist()}
     yield from _switched(scene, priors, settings, generator)
     mid_plan = (seen.length >= FORECAST_AFTER).nonzero()[:FORECASTED, 0]
     if len(mid_plan):

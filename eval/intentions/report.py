@@ -7,10 +7,10 @@ import pandas as pd
 import torch
 from matplotlib.figure import Figure
 
+from eval.intentions.calibration import calibration_error, filled_bins
 from eval.intentions.grid import FORECAST_AFTER, SWITCH_AT
 from eval.intentions.run import LABYRINTH
 from eval.worlds import runs
-from neuroprior.behaviour.analysis.calibration import Reliability
 from neuroprior.behaviour.analysis.statistics import mean_interval
 from neuroprior.behaviour.report.document import Column, Document, table
 from neuroprior.behaviour.report.drawing import WIDTH, at_edges, band, drawn, legend, panels
@@ -111,11 +111,11 @@ def calibration_errors(counted: pd.DataFrame) -> pd.DataFrame:
     found = []
     for place, own in counted.groupby(["world", "kind", "plans"], sort=False):
         sums, number = torch.tensor(own["sums"].tolist(), dtype=torch.double), len(own)
-        error = Reliability(sums).expected_calibration_error
+        error = calibration_error(sums)
         ends = [float("nan")] * 2
         if number > 1:
-            without = [Reliability(sums[torch.arange(number) != k]) for k in range(number)]
-            values = [number * error - (number - 1) * one.expected_calibration_error for one in without]
+            without = [calibration_error(sums[torch.arange(number) != k]) for k in range(number)]
+            values = [number * error - (number - 1) * one for one in without]
             half = mean_interval(values).high - mean_interval(values).mean
             ends = [max(error - half, 0.0), error + half]
         found.append((*place, error, *ends, number))
@@ -173,9 +173,9 @@ def observers_figure(rows: pd.DataFrame, counted: pd.DataFrame, worlds: Sequence
             some = own[(own["kind"] == kind) & (own["plans"] == number)].sort_values("at")
             band(above, some[["at", "value", "low", "high"]].to_numpy(float), KINDS[kind], name, style)
             here = counted[(counted["world"] == world) & (counted["kind"] == kind) & (counted["plans"] == number)]
-            bins = Reliability(torch.tensor(here["sums"].tolist(), dtype=torch.double)).bins
             if kind in ("exact", "cell", "cell, tempered"):
-                points = [[one.forecast, *one.taken] for one in bins]
+                sums = torch.tensor(here["sums"].tolist(), dtype=torch.double)
+                points = [[one.forecast, *one.true] for one in filled_bins(sums)]
                 band(below, points, KINDS[kind], name, style)
         above.set_xscale("log", base=2)
         above.set_xticks(sorted(own["at"].unique()), [f"{at:.0f}" for at in sorted(own["at"].unique())])

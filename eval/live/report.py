@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from eval.live.run import FORESIGHT, ORACLE, PARTS, RANDOM
 from eval.worlds import runs
-from neuroprior.behaviour.analysis.statistics import mean_intervals
+from eval.worlds.aggregates import mean_intervals
 from neuroprior.behaviour.report.document import Column, Document, table
 from neuroprior.behaviour.report.drawing import WIDTH, at_edges, band, drawn, legend, panels
 from neuroprior.behaviour.report.page import FigureBox, Section, Table
@@ -57,7 +57,6 @@ def live_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str, A
         settings,
         command,
         {"words": [lead]},
-        former_names=runs.FORMER_NAMES,
     )
 
 

@@ -21,7 +21,7 @@ from eval.mice.experiment import (
     simulate,
 )
 from eval.worlds.labyrinth import DATA, NODES, check_fits
-from eval.worlds.runs import FORMER_NAMES, check_distinct, plus_minus, table_by
+from eval.worlds.runs import check_distinct, plus_minus, table_by
 from neuroprior import read_plans
 from neuroprior._files import write_json
 from neuroprior._jobs import Progress
@@ -77,10 +77,9 @@ def mice(
         asdict(settings),
         results={"seed": seed},
         keys={"mice": "rows"},
-        former_names=FORMER_NAMES,
     )
     show(document, console)
-    write_frames(folder, document.written)
+    write_frames(folder, document.frames)
     write_json(folder / "results.json", results_of(document))
     examples = {
         "random legal moves": UNIFORM,

@@ -56,7 +56,7 @@ def options_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str
     sections = [Section("Reached against candidates", figures=boxes), Section("Tables", tables=tables)]
     lead = " ".join(leads) or "Differences need at least two seeds."
     frames = {"rows": rows, "paired": gaps}
-    return Document("Modes as options", lead, sections, frames, settings, command, former_names=runs.FORMER_NAMES)
+    return Document("Modes as options", lead, sections, frames, settings, command)
 
 
 def compared_pairs(frame: pd.DataFrame, modes: Sequence[int]) -> pd.DataFrame:

@@ -17,7 +17,6 @@ from eval.paper.planners import (
     share_table,
 )
 from neuroprior import ExhaustivePlanner, MarkovPrior, Plans, gridworld, oracle
-from neuroprior.behaviour.analysis.statistics import best_of
 from neuroprior.planners import Decision
 from neuroprior.plans import all_plans
 from neuroprior.worlds import GridWorld
@@ -30,6 +29,11 @@ PAPER_MATRIX = torch.tensor([[(0.60, 0.20, 0.0, 0.20)[(b - a) % 4] for b in rang
 
 PROTOCOLS = {"edges": ("torus", "wall"), "ties": ("uniform", "first"), "learn_from": ("all", "shortest")}
 """What the paper leaves open."""
+
+
+def best_of(scores: Tensor, baselines: Tensor) -> Tensor:
+    """`[K, ...]`: where each of K planners was at least as good as every baseline `[B, ...]`: ties count for each."""
+    return scores >= baselines.amax(0)
 
 
 class FirstResult(NamedTuple):
@@ -48,7 +52,7 @@ class FirstResult(NamedTuple):
     def table(self) -> pd.DataFrame:
         """Table 1: in what share of the starts each planner was best of the paper's four, and its rewards."""
         scores = self.scores() | {"oracle": self.oracle}
-        best = best_of(torch.stack(list(scores.values())), [list(scores).index(name) for name in PAPER_BEST])
+        best = best_of(torch.stack([*scores.values()]), torch.stack([scores[name] for name in PAPER_BEST]))
         steps = [decision.model_steps for decision in self.decisions.values()]
         return share_table("best", dict(zip(scores, best, strict=True)), PAPER_BEST).assign(
             mean_reward=[float(own.double().mean()) for own in scores.values()],

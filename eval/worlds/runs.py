@@ -16,24 +16,15 @@ from typing import Any, NamedTuple
 import pandas as pd
 from jsonargparse.typing import extend_base_type, restricted_number_type
 
+from eval.worlds.aggregates import interquartile_gap, interquartile_mean, mean_intervals, probability_of_improvement
 from neuroprior._files import read_json
 from neuroprior._jobs import JobRun
-from neuroprior.behaviour.analysis.statistics import (
-    holm,
-    interquartile_gap,
-    interquartile_mean,
-    mean_intervals,
-    paired_difference,
-    probability_of_improvement,
-)
+from neuroprior.behaviour.analysis.statistics import holm, paired_difference
 from neuroprior.behaviour.report.document import Column, Document, publish, table
 from neuroprior.behaviour.report.page import Table
 
 MAKERS = ("gymnasium", "minigrid", "mujoco")
 """Packages of which another version may make other worlds."""
-
-FORMER_NAMES = {"context": "sees"}
-"""Of columns in files, see `Document`."""
 
 Seed = restricted_number_type("Seed", int, [(">=", 0), ("<", 2**40)], docstring="A seed of everything random.")
 

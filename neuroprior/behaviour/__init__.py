@@ -3,7 +3,6 @@
 The report is in `neuroprior.behaviour.report`; intervals and tests in `neuroprior.behaviour.analysis.statistics`.
 """
 
-from neuroprior.behaviour.analysis.calibration import Reliability, reliability
 from neuroprior.behaviour.analysis.comparison import (
     Baseline,
     Score,
@@ -30,35 +29,26 @@ from neuroprior.behaviour.analysis.drift import (
     by_plan,
     by_position,
 )
-from neuroprior.behaviour.analysis.lags import LagInformation, bits_by_position, mutual_information, pieces
+from neuroprior.behaviour.analysis.lags import LagInformation, mutual_information
 from neuroprior.behaviour.analysis.modes import (
     ModeChoice,
     choose_modes,
-    match_modes,
     mode_frame,
     mode_plans,
     mode_table,
-    mode_transitions,
 )
 from neuroprior.behaviour.analysis.motifs import Motif, motifs
-from neuroprior.behaviour.analysis.orders import OrderFit, order_selection
 from neuroprior.behaviour.analysis.permutation_design import PermutationDesign
 from neuroprior.behaviour.analysis.statistics import (
     Difference,
     Interval,
-    best_of,
     holm,
-    interquartile_gap,
-    interquartile_mean,
     mean_interval,
-    mean_intervals,
     paired_difference,
-    probability_of_improvement,
     ratio_difference,
     share_interval,
 )
 from neuroprior.behaviour.analysis.transitions import Transitions, transitions
-from neuroprior.behaviour.analysis.two_sample import TwoSampleTest, two_sample_tests
 from neuroprior.behaviour.durations.duration_model import DurationLaw, DurationModel
 from neuroprior.behaviour.durations.laws import LAW_NAMES, LawName
 from neuroprior.behaviour.durations.semi_markov import SemiMarkovPrior
@@ -86,49 +76,34 @@ __all__ = [
     "LawName",
     "ModeChoice",
     "Motif",
-    "OrderFit",
     "PermutationDesign",
     "PlanDrift",
     "PositionDrift",
-    "Reliability",
     "Score",
     "SemiMarkovPrior",
     "Transitions",
-    "TwoSampleTest",
     "action_bits",
     "action_drift",
     "baselines",
-    "best_of",
-    "bits_by_position",
     "by_group",
     "by_plan",
     "by_position",
     "choose_modes",
     "compare_conditions",
     "holm",
-    "interquartile_gap",
-    "interquartile_mean",
-    "match_modes",
     "mean_interval",
-    "mean_intervals",
     "mode_frame",
     "mode_plans",
     "mode_table",
-    "mode_transitions",
     "motifs",
     "mutual_information",
-    "order_selection",
     "paired_difference",
-    "pieces",
-    "probability_of_improvement",
     "ratio_difference",
-    "reliability",
     "score",
     "score_bits",
     "share_interval",
     "simulated_study",
     "transitions",
-    "two_sample_tests",
     "unit_name",
     "units",
 ]

@@ -94,17 +94,17 @@ class Table:
         if not hasattr(frame, "columns") or not hasattr(frame, "iloc"):
             raise ValueError(f"{of}: a pandas frame is expected, not {type(frame).__name__}")
         if not isinstance(columns, Columns | Mapping | None):
-            raise ValueError(f"columns: what each holds is expected, as in {{'action': 'behaviour'}}, not {columns!r}")
+            raise ValueError(f"`columns` must say what each holds, as {{'action': 'behaviour'}}, got {columns!r}.")
         try:
             given = asdict(columns if isinstance(columns, Columns) else Columns(**(columns or {})))
         except TypeError as error:
-            raise ValueError(f"columns: some of {', '.join(asdict(Columns()))} are expected ({error})") from None
+            raise ValueError(f"`columns` must be some of {', '.join(asdict(Columns()))} ({error}).") from None
         context = given.pop("context")
         features = [context] if isinstance(context, str) else list(context or ())
         self.at = {what: self._find(what, name) for what, name in given.items() if name is not None}
         self.context = [self._find("context", name) for name in features]
         if len(set(self.context)) < len(self.context):
-            raise ValueError(f"columns.context: a column is given twice: {', '.join(map(str, features))}")
+            raise ValueError(f"`columns.context` must not name a column twice, got {', '.join(map(str, features))}.")
         taken = {*self.at.values(), *self.context}
         usual = {str(name).strip().lower(): i for i, name in reversed(list(enumerate(frame.columns))) if i not in taken}
         named = list(map(str, frame.columns))
@@ -132,13 +132,11 @@ class Table:
         ]
         twice = [name for i, name in enumerate(frame.columns) if once.count(i) > 1]
         if twice:
-            raise ValueError(f"columns: {twice[0]!r} is given for {' and '.join(self._uses(twice[0]))}")
+            uses = " and ".join(what for what, i in self.at.items() if frame.columns[i] == twice[0])
+            raise ValueError(f"`columns` must not name one column for {uses}, got {twice[0]!r}.")
 
     def _names(self) -> str:
         return ", ".join(map(str, self.frame.columns))
-
-    def _uses(self, name: str) -> list[str]:
-        return [what for what, i in self.at.items() if self.frame.columns[i] == name]
 
     def _find(self, what: str, name: Any) -> int:
         """The position of a column by its name; by its name in lower case where that is the only one."""
@@ -146,10 +144,10 @@ class Table:
         found = [i for i, known in enumerate(names) if known == name]
         found = found or [i for i, known in enumerate(names) if known.strip().lower() == name.strip().lower()]
         if len(found) != 1:
-            much = "there twice" if found else f"not there; the columns are {self._names()}"
+            once = "a column that is there once" if found else f"one of {self._names()}"
             several = what == "context" and all(part.strip() in names for part in name.split(","))
             hint = f" (several are given as '[{name}]')" if several else ""
-            raise ValueError(f"columns.{what}: the column {name!r} is {much}{hint}")
+            raise ValueError(f"`columns.{what}` must be {once}, got {name!r}{hint}.")
         return found[0]
 
     def texts(self, position: int) -> tuple[Integers, list[str]]:
@@ -295,9 +293,9 @@ def fields_of(
         ValueError: the table holds no plans, or an argument is wrong.
     """
     if missing not in MISSING:
-        raise ValueError(f"missing: one of {', '.join(MISSING)} is expected, not {missing!r}")
+        raise ValueError(f"`missing` must be one of {', '.join(MISSING)}, got {missing!r}.")
     if max_gap is not None and (not is_number(max_gap) or not 0 <= max_gap < np.inf):
-        raise ValueError(f"max_gap: a time of at least 0 is expected, not {max_gap!r}")
+        raise ValueError(f"`max_gap` must be at least 0, got {max_gap!r}.")
     check_flags(merge_repeats=merge_repeats)
     names = check_names(num_actions, action_names)
     table = Table(frame, columns, place, of, decimal)
@@ -345,7 +343,7 @@ def fields_of(
     pause = np.zeros(len(row), bool)
     if max_gap is not None:
         if when is None or ends is None or not {"stop", "duration"} & table.at.keys():
-            raise ValueError("max_gap: the columns start, and stop or duration, are expected with it")
+            raise ValueError("`columns` must have start, and stop or duration, with `max_gap`.")
         endless = np.isnan(ends)
         if endless.any():
             notes.append(f"{int(endless.sum()):,} actions without an end count for max_gap as ended when they began")
@@ -424,9 +422,9 @@ def fields_of(
 def _paired(table: Table) -> tuple[Table, list[str]]:
     """The table with a row for each action, made of one whose starts and stops are rows of their own; and a note."""
     if "start" not in table.at:
-        raise ValueError("columns.event_type: the column of the times (columns.start) is expected with it")
+        raise ValueError("`columns.start` must be given with `columns.event_type`.")
     if given := [what for what in ("stop", "duration") if what in table.at]:
-        raise ValueError(f"columns.{given[0]}: stops are rows of their own (columns.event_type); leave it out")
+        raise ValueError(f"`columns.{given[0]}` must be left out where stops are rows (`columns.event_type`).")
     plan, _ = _plans_of_rows(table)
     time = table.numbers("start", table.at["start"], times=True)
     action, labels = table.texts(table.at["action"])
@@ -528,7 +526,7 @@ def _durations(
         if what in table.at:
             values = table.numbers(what, table.at[what], times=True)[row]
             if what == "stop" and when is None:
-                raise ValueError("columns.stop: a column of the starts (columns.start) is expected with it")
+                raise ValueError("`columns.start` must be given with `columns.stop`.")
             since: Any = 0.0 if what == "duration" or when is None else when
             taken = values - since
             if (taken < 0).any():

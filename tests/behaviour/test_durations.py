@@ -129,17 +129,6 @@ def test_a_model_is_saved_alone(tmp_path):
         load(tmp_path, kind=DurationModel)
 
 
-@pytest.mark.parametrize("law", TRUE)
-def test_laws_are_chosen_as_by_fits_without_each_part(law):
-    plans = of_one_action(draw(law, 300), 10)
-    (chosen,) = DurationModel(1, list(TRUE)).fit(plans).table()
-    scores = {name: -2.0 * (1 if name == "exponential" else 2) for name in TRUE}
-    for learned, left_out in folds(plans, 5):
-        for name in scores:
-            scores[name] += float(DurationModel(1, [name]).fit(plans[learned]).log_prob(plans[left_out]).sum())
-    assert chosen.law == max(scores, key=scores.get)
-
-
 def test_unknown_durations_are_left_out():
     times = draw("gamma", 1000).view(10, 100)
     missing = torch.rand(10, 100, generator=seeded(0)) < 0.3
@@ -325,22 +314,25 @@ def test_a_network_chooses_the_actions():
     assert prior.sample_plans(4, 5, generator=seeded(0)).durations.shape == (4, 5)
 
 
-def test_what_is_refused():
-    plans = transitions(4)
-    bare, unknown = Plans(plans.actions, 3), Plans(plans.actions, 3, durations=torch.full((4, 60), nan))
-    with refuses("durations: these plans have none"):
-        SemiMarkovPrior(3).fit(bare)
-    with refuses("all of these plans are unknown"):
-        DurationModel(3).fit(unknown)
-    with refuses("not 3"):
-        DurationModel(2).fit(plans)
-    with refuses("max_steps: not a setting"):
-        SemiMarkovPrior(3).fit(plans, max_steps=3)
-    with refuses("laws: some of exponential"):
-        DurationModel(3, ["normal"])
-    with refuses("laws: some of exponential"):
-        DurationModel(3, [])
-    with refuses("actions: a prior of 3 actions"):
-        SemiMarkovPrior(3, MarkovPrior(4))
-    with refuses("out of range"):
-        DurationModel(3).cdf(3, torch.ones(1))
+FEW = transitions(4)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: SemiMarkovPrior(3).fit(Plans(FEW.actions, 3)), "durations: these plans have none"),
+        (
+            lambda: DurationModel(3).fit(replace(FEW, durations=torch.full((4, 60), nan))),
+            "`durations` must have one at least",
+        ),
+        (lambda: DurationModel(2).fit(FEW), "`plans` must have 2 actions, as this model, got 3"),
+        (lambda: SemiMarkovPrior(3).fit(FEW, max_steps=3), "max_steps: not a setting"),
+        (lambda: DurationModel(3, ["normal"]), "`laws` must be some of exponential"),
+        (lambda: DurationModel(3, []), "`laws` must be some of exponential"),
+        (lambda: SemiMarkovPrior(3, MarkovPrior(4)), "`actions` must be a prior of 3 actions, got 4"),
+        (lambda: DurationModel(3).cdf(3, torch.ones(1)), "out of range"),
+    ],
+)
+def test_what_is_refused(call, words):
+    with refuses(words):
+        call()

@@ -8,11 +8,15 @@ import torch
 
 from neuroprior import Plans, load, write_plans
 from neuroprior.__main__ import main
-from neuroprior.behaviour.report.plan_report import report
+from neuroprior.behaviour.report import FitOptions, report
 from neuroprior.priors import SwitchingPrior
 from tests.support.sources import seeded
 
-QUICK: dict = {"models": ["counts"], "sections": ["modes"], "folds": 2, "processes": 1}
+
+def of_modes(plans, *numbers: int, **options):
+    """The report's section on these numbers of modes."""
+    fits = FitOptions(["counts"], modes=numbers, folds=2, processes=1)
+    return report(plans, fits=fits, sections=["modes"], **options)
 
 
 @pytest.fixture(autouse=True)
@@ -67,7 +71,7 @@ def test_what_is_wrong_is_named_in_one_line(file, tmp_path, capsys, arguments, m
 
 def test_the_report_describes_the_modes(file, tmp_path):
     """The commonest takes action 0 or 1 alone, and comes back; the runs are the modes' own."""
-    made = report(file, modes=[1, 2], out=tmp_path / "report", **QUICK)
+    made = of_modes(file, 1, 2, out=tmp_path / "report")
     assert [section.title for section in made.sections] == ["Hidden modes"]
     frames = made.frames
     assert frames["modes"].loc[frames["modes"]["chosen"], "modes"].tolist() == [2]
@@ -90,7 +94,7 @@ def test_the_report_compares_conditions_by_modes():
     actions = torch.where(wild, torch.randint(3, (36, 80), generator=seeded(2)), mode)
     group = torch.arange(36) % 12
     plans = Plans(actions, 3, group=group, condition=often[:, 0], condition_names=("control", "treated"))
-    made = report(plans, modes=[2], **QUICK)
+    made = of_modes(plans, 2)
     tests = made.frames["mode_condition_tests"].set_index("test")
     assert tests.loc["actions", "p_value"] < 0.05
     assert "mode_conditions" in made.figures
@@ -100,15 +104,17 @@ def test_the_report_compares_conditions_by_modes():
 
 def test_the_report_says_where_there_is_no_sign_of_modes():
     actions = torch.randint(3, (20, 40), generator=seeded(0))
-    made = report(Plans(actions, 3), modes=[1, 2], **QUICK)
+    made = of_modes(Plans(actions, 3), 1, 2)
     assert "no sign" in made.sections[0].text[-1]
     assert list(made.frames) == ["modes"]
 
 
-@pytest.mark.parametrize("given", [{"modes": [0]}, {"modes": [2], "priors": {"one": SwitchingPrior(3)}}])
-def test_the_report_refuses_modes_that_cannot_be(given):
+def test_the_report_refuses_modes_that_cannot_be():
+    plans = Plans(torch.zeros(4, 4, dtype=torch.long), 3)
     with pytest.raises(ValueError, match="modes"):
-        report(Plans(torch.zeros(4, 4, dtype=torch.long), 3), models=["counts"], **given)
+        of_modes(plans, 0)
+    with pytest.raises(ValueError, match="`models`, `modes`, `folds` must be left out"):
+        of_modes(plans, 2, priors={"one": SwitchingPrior(3)})
 
 
 @pytest.mark.slow
@@ -118,7 +124,7 @@ def test_the_modes_of_a_single_long_plan_are_described_over_its_course():
     mode[:100] = 0
     wild = torch.rand(500, generator=seeded(1)) < 0.2
     actions = torch.where(wild, torch.randint(3, (500,), generator=seeded(2)), mode)
-    made = report(Plans(actions[None], 3), modes=[2], skip=30, **QUICK)  # more than a part has
+    made = of_modes(Plans(actions[None], 3), 2, skip=30)  # more than a part has
     assert len(made.frames["mode_actions"]) == 500
     assert made.frames["mode_actions"]["step"].max() == 499
     occupancy = made.frames["mode_occupancy"]

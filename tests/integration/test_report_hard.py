@@ -57,7 +57,7 @@ ALIKE = ("a single plan", "plans of two actions", "always the same")
 def test_hard_files_have_a_report(what, tmp_path, recwarn):
     plans = HARD[what]
     closed = int(plans.end is not None)
-    results = report(plans, tmp_path, folds=2)
+    results = report(plans, tmp_path)
     found = bits(results)
     assert found["uniform"] == pytest.approx(math.log2(plans.num_actions - closed), abs=1e-6)
     assert len(found) == 9
@@ -69,7 +69,7 @@ def test_hard_files_have_a_report(what, tmp_path, recwarn):
 
 @pytest.mark.slow
 def test_long_plans_of_many_actions(tmp_path):
-    assert len(bits(report(chain(2, 2500, 57), tmp_path, folds=2))) == 9
+    assert len(bits(report(chain(2, 2500, 57), tmp_path))) == 9
 
 
 def test_names_are_text(tmp_path, capsys, monkeypatch, undrawn):
@@ -98,11 +98,11 @@ FEW = chain(20, 5)
 BAD = {
     "no action at all": (Plans(torch.zeros(3, 4).long(), 3, torch.zeros(3).long()), [], ("no plan has an action",)),
     "a single action": (Plans(torch.zeros(1, 1).long(), 3), [], ("at least two plans", "new.npz")),
-    "one fold": (FEW, ["--folds", "1"], ("folds", "at least 2", "not 1")),
+    "one fold": (FEW, ["--folds", "1"], ("`folds` must be from 2 to 20", "got 1")),
     "no folds": (FEW, ["--folds", "0"], ("folds", "not 0")),
-    "more folds than plans": (FEW, ["--folds", "21"], ("folds", "20", "not 21")),
-    "more folds than groups": (replace(FEW, group=torch.arange(20) % 4), ["--folds", "5"], ("at most 4", "not 5")),
-    "nothing left to score": (FEW, ["--skip", "5"], ("skip", "first 5")),
+    "more folds than plans": (FEW, ["--folds", "21"], ("folds", "20", "got 21")),
+    "more folds than groups": (replace(FEW, group=torch.arange(20) % 4), ["--folds", "5"], ("2 to 4", "got 5")),
+    "nothing left to score": (FEW, ["--skip", "5"], ("skip", "got 5")),
     "a negative skip": (FEW, ["--skip=-1"], ("skip", "-1")),
     "no steps": (FEW, ["--max-steps", "0"], ("max_steps", "0")),
     "no processes": (FEW, ["--processes", "0"], ("processes", "0")),

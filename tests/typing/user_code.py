@@ -31,7 +31,7 @@ from neuroprior import (
     save,
     write_plans,
 )
-from neuroprior.behaviour import DurationModel, mean_interval, order_selection
+from neuroprior.behaviour import DurationModel, mean_interval
 from neuroprior.control import DoubleIntegrator, ICEMPlanner, NoisePrior, VectorDecision, VectorPlans, VectorPrior
 from neuroprior.planners import Decision, Execution, execute
 from neuroprior.priors.learning import training_plans
@@ -56,7 +56,6 @@ def behaviour(folder: Path) -> MarkovPrior:
     assert_type(load(save(prior, folder / "prior")), Prior)
     assert_type(fit(again, ContextTreePrior), Prior)
     assert_type(fit(again, partial(GRUPrior, hidden_size=8), max_steps=1), Prior)
-    order_selection(again, max_order=1)
     assert mean_interval([1.0, 2.0, 4.0]).low < 7 / 3
     return prior
 

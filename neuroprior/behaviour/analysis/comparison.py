@@ -47,7 +47,7 @@ class Score:
             ValueError: the two were not scored on the same plans.
         """
         if self.digest != other.digest or not self.actions.equal(other.actions):
-            raise ValueError(f"{self.model}, {other.model}: scores on the same plans are expected, and these are not")
+            raise ValueError(f"{self.model} and {other.model} must be scored on the same plans.")
         gap = self.bits - other.bits
         noise = gap.abs() <= ROUNDING * torch.maximum(self.bits.abs(), other.bits.abs())
         return ratio_difference(gap.masked_fill(noise, 0), self.actions)
@@ -95,13 +95,13 @@ def score_bits(model: str, inputs: str, bits: Tensor, plans: Plans, mask: Tensor
     """
     mask, within = (plans.mask() if mask is None else mask).cpu(), plans.mask().cpu()
     if mask.dtype != torch.bool or mask.shape != within.shape or bool((mask & ~within).any()):
-        raise ValueError(f"mask: bool of shape {list(within.shape)}, False behind the end of a plan, is expected")
+        raise ValueError(f"`mask` must be bool of shape {list(within.shape)}, False behind the end of a plan.")
     if bits.shape != mask.shape or bool(bits[mask].isnan().any()):
-        raise ValueError(f"bits: numbers of shape {list(mask.shape)} are expected, not NaN, and not {list(bits.shape)}")
+        raise ValueError(f"`bits` must be numbers of shape {list(mask.shape)}, not NaN, got {list(bits.shape)}.")
     unit = units(plans, mask)[mask].unique(return_inverse=True)[1]
     size = int(unit.max()) + 1 if len(unit) else 0
     if size < FEWEST_UNITS:
-        raise ValueError(f"plans: at least two held-out actions are needed for a comparison, not {int(mask.sum())}")
+        raise ValueError(f"`plans` must have at least two held-out actions, got {int(mask.sum())}.")
     totals = torch.zeros(size, dtype=torch.double).index_add_(0, unit, bits[mask].double())
     scored = hashlib.sha256()
     for part in (within.sum(1), plans.actions.cpu()[within].long(), mask[within]):
@@ -127,7 +127,7 @@ def action_bits(prior: Prior, plans: Plans) -> Tensor:
         [[1.58, 1.58, 1.58]]
     """
     if not isinstance(prior, Prior):
-        raise ValueError(f"prior: a fitted prior is expected, not {type(prior).__name__}")
+        raise ValueError(f"`prior` must be a fitted prior, got {type(prior).__name__}.")
     check_are_plans(plans)
     given = plans if prior.takes_context else plans.without_context()
     with torch.no_grad():

@@ -64,15 +64,12 @@ class ConditionChains:
         p_k(b | a) = (n_k(a b) + s p(b | a)) / (n_k(a) + s)    the chain that does
 
     Attributes:
-        sequences: int64 `[K, 2]`: the transitions that occurred; -1 for the beginning of a plan.
         unknown: float64 `[B]`: the log2-likelihood of each block under the chain that does not know the condition.
     """
 
-    sequences: Tensor
     unknown: Tensor
     _cells: _Counts
     _rows: _Counts
-    _first: Tensor  # int64 [Z]: where the row of each cell is
     _blocks: Tensor  # int64 [B, S]: those of the unit of each block
     _prior: Tensor  # float64 [Z, 1]: p(b | a) without the unit
 
@@ -98,8 +95,7 @@ class ConditionChains:
         prior = (alone[second] + SMOOTHING / size) / (total[cells.block] + SMOOTHING)
         prior = (in_cells + SMOOTHING * prior) / (in_rows[first] + SMOOTHING)
         unknown = prior.new_zeros(len(unit)).index_add_(0, cells.block, cells.times * prior[:, 0].log2())
-        sequences[sequences == size] = -1
-        return ConditionChains(sequences, unknown, cells, rows, first, blocks, prior)
+        return ConditionChains(unknown, cells, rows, blocks, prior)
 
     @property
     def cost(self) -> int:
@@ -127,27 +123,3 @@ class ConditionChains:
                     sums.index_add_(0, counts.block, logs.mul_(counts.times[:, None]), alpha=sign)
                 found[condition, :, at : at + size] = sums
         return found
-
-    def carried(self, label: Tensor, num: int) -> tuple[Tensor, Tensor]:
-        """How much each transition adds to the held-out log odds of the right condition, and which it speaks for.
-
-        Args:
-            label: int64 `[B]`: the condition of each block.
-            num: of conditions, C.
-
-        Returns:
-            float64 `[K]`, bits in all blocks together: log2 p_k(b | a) of the right condition less the mean of the
-            others, summed over all times; and int64 `[K]`: the condition under which the transition is most probable.
-        """
-        cells, rows, odds = self._cells, self._rows, []
-        for condition in range(num):
-            taken = (label == condition).double()[:, None]
-            above = cells.without_unit(taken, self._blocks) + SMOOTHING * self._prior
-            odds.append((above / (rows.without_unit(taken, self._blocks)[self._first] + SMOOTHING)).log2()[:, 0])
-        logs = torch.stack(odds)
-        right = logs.gather(0, label[cells.block][None])[0]
-        over = (num * right - logs.sum(0)) / (num - 1)
-        width = len(self.sequences)
-        sums = over.new_zeros(width).index_add_(0, cells.column, cells.times * over)
-        speaks = logs.new_zeros(num, width).index_add_(1, cells.column, cells.times * logs).argmax(0)
-        return sums, speaks

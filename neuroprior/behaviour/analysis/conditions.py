@@ -38,6 +38,9 @@ LEAST_VARIANCE = 1e-6
 TIE = 1e-8
 """Statistics that differ by less than this, or by less than this share, are tied: rounding depends on sums' order."""
 
+MAX_WORK = 5 * 10**8
+"""Numbers that permutations may compute, some ten seconds on one core; beyond, fewer are made."""
+
 NUMBERS_AT_ONCE = 2**20
 """Statistics that are in memory at a time."""
 
@@ -92,10 +95,6 @@ class ConditionPrediction:
         p_value: of the accuracy, by permutation; of equal accuracies that with the larger mean log odds is the better.
         log_odds: float64 `[B, C]`: the held-out log2-likelihood of each block under each condition, less the mean of
             those under the others.
-        sequences: int64 `[K, 2]`: the transitions that occurred; -1 for the beginning of a plan.
-        carried: float64 `[K]`: what each adds to the log odds of the right condition, bits per action in all; below 0
-            where it misleads.
-        speaks_for: int64 `[K]`: the rank of the condition under which it is most probable.
     """
 
     gain: Difference
@@ -103,9 +102,6 @@ class ConditionPrediction:
     expected: float
     p_value: float
     log_odds: Tensor
-    sequences: Tensor
-    carried: Tensor
-    speaks_for: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,11 +146,7 @@ class ConditionComparison:
 
 
 def compare_conditions(
-    plans: Plans,
-    permutations: int = 9_999,
-    generator: torch.Generator | None = None,
-    *,
-    max_work: int = 5 * 10**8,
+    plans: Plans, permutations: int = 9_999, generator: torch.Generator | None = None
 ) -> ConditionComparison:
     """Whether behaviour differs between the conditions of plans.
 
@@ -172,13 +164,12 @@ def compare_conditions(
 
     Args:
         plans: with a `condition`. An end symbol is an action like others.
-        permutations: at most so many random ones.
+        permutations: at most so many random ones; fewer where they take more than `MAX_WORK`, but at least
+            `FEWEST_PERMUTATIONS`.
         generator: draws them.
-        max_work: numbers that they may compute, some ten seconds on one core; fewer permutations are made if need be,
-            but at least `FEWEST_PERMUTATIONS`.
 
     Raises:
-        ValueError: the plans have no condition, or `permutations` or `max_work` is below 1.
+        ValueError: the plans have no condition, or `permutations` is below 1.
 
     Example:
         >>> first, second = torch.tensor([[0, 1] * 10]).repeat(8, 1), torch.tensor([[0, 0, 1, 1] * 5]).repeat(8, 1)
@@ -188,7 +179,7 @@ def compare_conditions(
         True
     """
     check_are_plans(plans)
-    check_sizes(permutations=permutations, max_work=max_work)
+    check_sizes(permutations=permutations)
     design = PermutationDesign.of(plans)
     names = [
         plans.condition_names[c] if plans.condition_names else f"condition {c}" for c in design.conditions.tolist()
@@ -204,7 +195,7 @@ def compare_conditions(
     chains = ConditionChains.of(flat, block, design.unit)
     num = len(names)
     cost = num * (chains.cost + sum(numbers.smoothed.numel() for numbers in found) // 8)
-    drawn = min(permutations, max(max_work // max(cost, 1), FEWEST_PERMUTATIONS))
+    drawn = min(permutations, max(MAX_WORK // max(cost, 1), FEWEST_PERMUTATIONS))
     labellings = design.labellings(drawn, generator)
     families, statistics = [], {}
     for numbers in found:
@@ -390,7 +381,7 @@ def _predicted(
     chains: ConditionChains, design: PermutationDesign, labellings: Tensor, actions: Tensor
 ) -> tuple[ConditionPrediction, Tensor, Tensor]:
     """The prediction; the bits that knowing the condition saves, and the accuracy, under each labelling `[P]`."""
-    num, label = len(design.conditions), design.label
+    num = len(design.conditions)
     gains = chains.gains(labellings, num)  # [C, B, P]
     right = gains.gather(0, labellings.long()[None])[0]
     bits = right.sum(0)
@@ -410,18 +401,8 @@ def _predicted(
     sizes = torch.zeros(units, dtype=torch.double).index_add_(0, design.unit, actions)
     mean, low, high, _ = ratio_difference(saved, sizes)
     gain = Difference(mean, low, high, float(_shares_reaching(bits)[0]))
-    carried, speaks_for = chains.carried(label, num)
-    prediction = ConditionPrediction(
-        gain,
-        float(share[0]),
-        float(share.mean()),
-        float(_shares_reaching(order)[0]),
-        odds[:, :, 0].T,
-        chains.sequences,
-        carried / actions.sum(),
-        speaks_for,
-    )
-    return prediction, bits, order
+    p_value = float(_shares_reaching(order)[0])
+    return ConditionPrediction(gain, float(share[0]), float(share.mean()), p_value, odds[:, :, 0].T), bits, order
 
 
 def _shares_reaching(statistics: Tensor) -> Tensor:

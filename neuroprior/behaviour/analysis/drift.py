@@ -153,7 +153,7 @@ def by_position(plans: Plans, bits: Tensor, mask: Tensor, parts: int = 10) -> Po
         found.append(_interval(counted.bits[here], counted.unit[here]) if here.any() else Interval(nan, nan, nan))
     off, excess = _about_means(place, counted.plan), _about_means(counted.bits, counted.plan)
     if float(off.square().sum()) < 1e-12:
-        raise ValueError("mask: no plan has two actions that count, so there is no trend within plans")
+        raise ValueError("`mask` must have two actions of one plan, for a trend within plans.")
     trend = ratio_difference(_sums(off * excess, counted.unit), _sums(off.square(), counted.unit))
     return PositionDrift(found, part.bincount(minlength=parts).cpu(), trend)
 
@@ -250,7 +250,7 @@ def action_drift(plans: Plans) -> list[ActionDrift]:
     unit = whole.unique(return_inverse=True)[1]
     num = int(unit.max()) + 1 if len(unit) else 0
     if num < FEWEST_UNITS:
-        raise ValueError("plans: two plans of at least two actions are needed, or a single one of at least four")
+        raise ValueError("`plans` must be two of at least two actions, or a single one of at least four.")
     actions, sign = plans.actions[mask], torch.where(late.expand(mask.shape)[mask], 1.0, -1.0).double()
     sizes = unit.bincount().double() / 2
     found = []
@@ -268,22 +268,20 @@ def _counted(plans: Plans, bits: Tensor, mask: Tensor) -> _Counted:
     """The actions that count, after checks; on the device of `bits`."""
     check_are_plans(plans)
     shape = plans.actions.shape
-    for name, values in (("bits", bits), ("mask", mask)):
-        if values.shape != shape:
-            raise ValueError(f"{name}: shape {list(shape)}, that of the actions, is expected, not {list(values.shape)}")
-    if mask.dtype != torch.bool:
-        raise ValueError(f"mask: bool is expected, not {str(mask.dtype).removeprefix('torch.')}")
+    if bits.shape != shape:
+        raise ValueError(f"`bits` must have the shape {list(shape)} of the actions, got {list(bits.shape)}.")
+    if mask.shape != shape or mask.dtype != torch.bool:
+        raise ValueError(f"`mask` must be bool of shape {list(shape)}, got {mask.dtype} {list(mask.shape)}.")
     mask, within = mask.to(bits.device), plans.mask().to(bits.device)
-    for wrong, what in ((mask & ~within, "mask"), (mask & ~bits.isfinite(), "bits")):
-        if wrong.any():
-            where = wrong.nonzero()[0].tolist()
-            why = (
-                "the plan has ended there" if what == "mask" else f"{float(bits[tuple(where)])} is not a finite number"
-            )
-            raise ValueError(f"{what}{where}: {why}")
+    if bool((mask & ~within).any()):
+        where = (mask & ~within).nonzero()[0].tolist()
+        raise ValueError(f"`mask{where}` must be False, where the plan has ended.")
+    if not bool(bits[mask].isfinite().all()):
+        where = (mask & ~bits.isfinite()).nonzero()[0].tolist()
+        raise ValueError(f"`bits{where}` must be finite, got {float(bits[tuple(where)])}.")
     unit = units(plans, mask)[mask]
     if len(unit) == 0 or bool((unit == unit[0]).all()):
-        raise ValueError(f"mask: at least two actions that count are needed, not {len(unit)}")
+        raise ValueError(f"`mask` must have at least two actions that count, got {len(unit)}.")
     plan, step = mask.nonzero().unbind(1)
     return _Counted(bits[mask].double(), plan, step, within.sum(1)[plan], unit)
 

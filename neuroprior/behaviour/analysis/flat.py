@@ -33,12 +33,6 @@ class FlatPlans:
         plan = place.div(max(plans.max_length, 1), rounding_mode="floor")
         return FlatPlans(plans.actions.flatten()[place].long(), plan, place, plans.num_actions)
 
-    def without_repeats(self) -> "FlatPlans":
-        """The same plans with each run of one action merged into a single action."""
-        new = torch.ones_like(self.actions, dtype=torch.bool)
-        new[1:] = (self.actions[1:] != self.actions[:-1]) | (self.plan[1:] != self.plan[:-1])
-        return FlatPlans(self.actions[new], self.plan[new], self.place[new], self.num_actions)
-
     def starts(self, length: int) -> Tensor:
         """`[W]`: where `length` >= 1 consecutive actions of one plan begin, ascending."""
         until = max(len(self.plan) - length + 1, 0)

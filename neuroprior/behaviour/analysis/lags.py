@@ -9,11 +9,10 @@ from torch import Tensor
 
 from neuroprior._checks import check_count, check_sizes
 from neuroprior._random import generator_on
-from neuroprior.behaviour.analysis.comparison import Score, action_bits, unit_name, units
+from neuroprior.behaviour.analysis.comparison import unit_name, units
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS
 from neuroprior.plans.plans import check_are_plans
-from neuroprior.priors import Prior
 
 MOST_BLOCKS = 200
 """Blocks of the jackknife; more units are joined to so many."""
@@ -174,7 +173,7 @@ def pieces(plans: Plans, length: int, most: int, generator: torch.Generator | No
     """Pieces of `length` consecutive actions, cut from plans at random places, as plans of their own.
 
     A prior that is fitted to them as to whole plans predicts the action j of a piece from exactly j past actions: one
-    training gives the information in each past action (see `bits_by_position`). Pieces overlap: split plans between
+    training gives the information in each past action. Pieces overlap: split plans between
     training and validation before they are cut.
 
     Args:
@@ -184,17 +183,12 @@ def pieces(plans: Plans, length: int, most: int, generator: torch.Generator | No
         generator: draws them.
 
     Returns:
-        The pieces, in the order of the plans. A context per step is cut likewise, one per plan repeated. Their `group`
+        The pieces, in the order of the plans. A context per step is cut likewise. Their `group`
         is the independent unit (see `neuroprior.behaviour.units`): the group of the plan; or the number of the plan, if
         fewer than two groups have pieces; or one of `BLOCKS` consecutive parts, if only one plan has any.
 
     Raises:
         ValueError: no plan has that many actions, or `length` or `most` is below 1.
-
-    Example:
-        >>> plans = Plans(torch.arange(40)[None] % 4, 4)
-        >>> pieces(plans, length=5, most=3, generator=torch.Generator().manual_seed(0)).actions.shape
-        torch.Size([3, 5])
     """
     check_sizes(length=length, most=most)
     start_here = torch.zeros_like(plans.mask())
@@ -229,35 +223,3 @@ def pieces(plans: Plans, length: int, most: int, generator: torch.Generator | No
         condition_names=None,
         plan_names=None,
     )
-
-
-def bits_by_position(prior: Prior, plans: Plans) -> list[Score]:
-    """Scores of a prior on the action j of each plan, given the j before it, for j = 0 to L - 1.
-
-    On held-out `pieces`, `scores[j - 1].minus(scores[j])` is the information in the action j steps back beyond that in
-    the nearer ones.
-
-    Args:
-        prior: any prior over the plans' actions.
-        plans: held-out plans that all have L actions, such as `pieces`.
-
-    Returns:
-        L scores over the same units: the groups of the plans, or the plans where there are no two groups.
-
-    Raises:
-        ValueError: plans of unequal lengths, fewer than two, or that the prior cannot score.
-
-    Example:
-        >>> plans = Plans(torch.tensor([[0, 1, 2], [2, 1, 0]]), 3)
-        >>> [round(found.bits_per_action().mean, 2) for found in bits_by_position(UniformPrior(3), plans)]
-        [1.58, 1.58, 1.58]
-    """
-    mask = plans.mask().cpu()
-    if len(plans) < 2 or plans.max_length == 0 or not bool(mask.all()):
-        raise ValueError("plans: at least two of the same length are expected; see neuroprior.behaviour.pieces")
-    bits, unit = action_bits(prior, plans), units(plans, mask)[:, 0]
-    actions = unit.bincount().double()
-    totals = torch.zeros(len(actions), plans.max_length, dtype=torch.double).index_add_(0, unit, bits)
-    inputs = "actions and context" if prior.takes_context else "actions"
-    name = type(prior).__name__
-    return [Score(f"{name} after {j}", inputs, totals[:, j], actions) for j in range(plans.max_length)]

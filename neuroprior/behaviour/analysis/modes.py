@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.optimize import linear_sum_assignment
+from scipy.special import stdtrit
 from torch import Tensor
 
 from neuroprior._checks import as_list, check_sizes
@@ -116,7 +118,7 @@ def choose_modes(
     """
     numbers = sorted(set(as_list("num_modes", num_modes)))
     if not numbers:
-        raise ValueError("num_modes: at least one number is expected, not an empty list")
+        raise ValueError("`num_modes` must not be empty.")
     for number in numbers:
         check_sizes(num_modes=number)
     plans = divisible(plans)
@@ -125,14 +127,14 @@ def choose_modes(
     generator = generator_on(generator, "cpu")
     if num_units(given) < FEWEST_UNITS:
         raise ValueError(
-            "plans: at least two are expected, to learn from some and hold out others; `in_parts` cuts a single one"
+            "`plans` must be at least two, to learn from some and hold out others; `in_parts` cuts a single one."
         )
     if number_of_folds is None:
         number_of_folds = min(FOLDS, num_units(given))
     parts = folds(given, number_of_folds, draw_seed(generator) % 2**31)
     if mask is not None and (mask.dtype != torch.bool or mask.shape != given.actions.shape):
         shape = list(given.actions.shape)
-        raise ValueError(f"mask: bool {shape}, as the actions, is expected, not {mask.dtype} {list(mask.shape)}")
+        raise ValueError(f"`mask` must be bool of shape {shape}, got {mask.dtype} {list(mask.shape)}.")
     mask = given.mask() if mask is None else given.mask() & mask
     scores, priors, stability = {}, {}, {}
     inputs = "actions" if given.context is None else "actions and context"
@@ -164,32 +166,22 @@ def _best(scores: dict[int, Score]) -> int:
 
 def _excess(score: Score, best: Score) -> tuple[float, float]:
     """Bits per action more than the best, and the standard error of this difference; see `ratio_difference`."""
-    from scipy.special import stdtrit
-
     mean, low, high, _ = score.minus(best)
     return mean, (high - low) / 2 / float(stdtrit(len(score.bits) - 1, 0.975))
 
 
-def match_modes(one: Tensor, other: Tensor, mask: Tensor) -> Tensor:
-    """The mode of another prior that corresponds to each mode: int64 `[K]`, so that their posteriors correlate most.
+def agreements(one: Tensor, other: Tensor, mask: Tensor) -> Tensor:
+    """The correlation of each mode with its counterpart in another prior, matched so that their sum is largest.
 
     Args:
         one, other: `[N, L, K]`: posteriors of the modes behind the same actions.
         mask: `[N, L]` bool: the actions that count.
 
-    Example:
-        >>> one = torch.tensor([[0.9, 0.1], [0.2, 0.8]])[None]
-        >>> match_modes(one, one.flip(-1), torch.ones(1, 2, dtype=torch.bool)).shape
-        torch.Size([2])
+    Returns:
+        float64 `[K]`.
     """
-    from scipy.optimize import linear_sum_assignment
-
-    return torch.from_numpy(linear_sum_assignment(-_correlations(one, other, mask).numpy())[1])
-
-
-def agreements(one: Tensor, other: Tensor, mask: Tensor) -> Tensor:
-    """`[K]`: the correlation of each mode with that of another prior; for the arguments see `match_modes`."""
-    return _correlations(one, other, mask).gather(1, match_modes(one, other, mask)[:, None])[:, 0]
+    correlations = _correlations(one, other, mask)
+    return correlations[linear_sum_assignment(-correlations.numpy())]
 
 
 def _correlations(one: Tensor, other: Tensor, mask: Tensor) -> Tensor:
@@ -211,7 +203,7 @@ def mode_names(number: int) -> tuple[str, ...]:
 def _scored(prior: SwitchingPrior, plans: Plans) -> Plans:
     """The plans as the prior takes them."""
     if not isinstance(prior, SwitchingPrior):
-        raise ValueError(f"prior: a SwitchingPrior is expected, not {type(prior).__name__}")
+        raise ValueError(f"`prior` must be a SwitchingPrior, got {type(prior).__name__}.")
     check_are_plans(plans)
     return plans if prior.takes_context else plans.without_context()
 
@@ -243,24 +235,7 @@ def mode_plans(prior: SwitchingPrior, plans: Plans) -> Plans:
 
 
 def mode_transitions(prior: SwitchingPrior, plans: Plans) -> Tensor:
-    """How often each mode took each action after each, in expectation: `[K, A, A]`, float64, last by next action.
-
-    Args:
-        prior: fitted.
-        plans: N of them, such as it was fitted to.
-
-    Raises:
-        ValueError: plans that the prior cannot score.
-
-    Example:
-        >>> from neuroprior.priors import SwitchingPrior
-        >>> plans = Plans(torch.tensor([[0, 1] * 5 + [2, 3] * 5]).repeat(6, 1), 4)
-        >>> prior = SwitchingPrior(4, num_modes=2, order=0, folds=2, restarts=1).fit(
-        ...     plans, generator=torch.Generator().manual_seed(0)
-        ... )
-        >>> mode_transitions(prior, plans).shape
-        torch.Size([2, 4, 4])
-    """
+    """How often each mode took each action after each, in expectation: `[K, A, A]`, float64, last by next action."""
     given, size = _scored(prior, plans), plans.num_actions
     both, actions = plans.mask()[:, 1:], plans.actions.long()
     pair = (actions[:, :-1] * size + actions[:, 1:])[both]

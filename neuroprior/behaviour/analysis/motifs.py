@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy import stats
 from scipy.special import stdtrit, xlogy
 from torch import Tensor
 
@@ -26,17 +27,11 @@ POISSON_ZERO = -log(0.025)
 LEVEL = 0.05
 """Sequences with a corrected p-value up to this come first."""
 
+CANDIDATES_AT_ONCE = 2**20
+"""Candidate sequences that are in memory at a time."""
+
 COUNTS_AT_ONCE = 2**20
 """Counts of windows by unit that are in memory at a time."""
-
-TERMS = 64
-"""Terms of a hypergeometric tail that are summed together."""
-
-TAILS_AT_ONCE = 2**15
-"""Tails that are in memory at a time."""
-
-PRECISION = 1e-17
-"""A tail is summed until its terms are below this share of the sum."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,9 +63,6 @@ def motifs(
     plans: Plans,
     lengths: Sequence[int] = (3, 4, 5, 6),
     top: int | None = None,
-    collapse_repeats: bool = False,
-    *,
-    chunk_size: int = 2**20,
 ) -> list[Motif]:
     """The most over- and under-represented sequences of actions.
 
@@ -95,8 +87,6 @@ def motifs(
         plans: an end symbol is an action like others.
         lengths: numbers of actions, n.
         top: how many to return; None for all.
-        collapse_repeats: merge each run of one action into a single action first, so that runs do not fill the list.
-        chunk_size: candidate sequences that are in memory at a time.
 
     Returns:
         Those with a corrected p-value of up to `LEVEL` first: over-represented ones, then under-represented ones; then
@@ -104,32 +94,27 @@ def motifs(
         often with a larger ratio but fewer counts.
 
     Raises:
-        ValueError: a length below 2, or of 2 with `collapse_repeats`, as successive actions are then never
-            independent; a repeated length or none; `top` below 1.
+        ValueError: a length below 2; a repeated length or none; `top` below 1.
 
     Example:
         >>> plans = Plans(torch.tensor([[0, 1, 2, 3, 1, 0, 3, 2, 0, 1, 2, 1]]).repeat(5, 1), 4)
         >>> [found.actions for found in motifs(plans, lengths=[3], top=1)]
         [(3, 1, 0)]
     """
-    check_sizes(chunk_size=chunk_size)
     lengths = as_list("lengths", lengths)
-    least = 3 if collapse_repeats else 2
     for n in lengths:
-        if not isinstance(n, int) or isinstance(n, bool) or n < least:
-            why = " with collapse_repeats" if collapse_repeats else ""
-            raise ValueError(f"lengths: integers of at least {least} are expected{why}, not {n!r}")
+        if not isinstance(n, int) or isinstance(n, bool) or n < 2:
+            raise ValueError(f"`lengths` must be at least 2, got {n!r}.")
     if not lengths or len(set(lengths)) < len(lengths):
-        raise ValueError(f"lengths: one or more different integers are expected, not {list(lengths)}")
+        raise ValueError(f"`lengths` must be different integers, one or more, got {list(lengths)}.")
     if top is not None:
         check_sizes(top=top)
     flat = FlatPlans.of(plans)
-    flat = flat.without_repeats() if collapse_repeats else flat
     found, tests = [], 0
     for length, middle in _middles(flat, sorted(lengths)):
         start = flat.starts(length)
         windows = _Windows.of(flat, length, start, middle)
-        sequences = _candidates(windows, flat.num_actions, chunk_size)
+        sequences = _candidates(windows, flat.num_actions)
         tests += sequences.tests
         found.append(_test(flat, length, windows, sequences, _units(plans, flat.place[start])[windows.kept]))
     return _listed(found, tests, top)
@@ -182,12 +167,12 @@ class _Sequences(NamedTuple):
     tests: int
 
 
-def _candidates(windows: _Windows, num_actions: int, chunk_size: int) -> _Sequences:
+def _candidates(windows: _Windows, num_actions: int) -> _Sequences:
     """The sequences that are tested: every head with every tail of the same middle."""
     total, heads, tails = (rank.bincount() for rank in (windows.middle, windows.head, windows.tail))
     codes, rank, counts = (windows.head * len(tails) + windows.tail).unique(return_inverse=True, return_counts=True)
     parts, tests = [], 0
-    for head, tail in _pairs(windows, heads, tails, total, num_actions, chunk_size):
+    for head, tail in _pairs(windows, heads, tails, total, num_actions):
         tests += len(head)
         at = torch.searchsorted(codes, head * len(tails) + tail).clamp(max=max(len(codes) - 1, 0))
         count = torch.where(codes[at] == head * len(tails) + tail, counts[at], 0)
@@ -203,7 +188,7 @@ def _candidates(windows: _Windows, num_actions: int, chunk_size: int) -> _Sequen
 
 
 def _pairs(
-    windows: _Windows, heads: Tensor, tails: Tensor, total: Tensor, num_actions: int, chunk_size: int
+    windows: _Windows, heads: Tensor, tails: Tensor, total: Tensor, num_actions: int
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """The heads and tails that share a middle, frequent enough but not around all of it; heads ascending."""
     of_head = windows.head_code.div(num_actions, rounding_mode="floor")
@@ -213,7 +198,7 @@ def _pairs(
     partners = of_tail[tail].bincount(minlength=len(total))
     first = (partners.cumsum(0) - partners)[of_head[head]]
     partners = partners[of_head[head]]
-    block = partners.cumsum(0).div(chunk_size, rounding_mode="floor")
+    block = partners.cumsum(0).div(CANDIDATES_AT_ONCE, rounding_mode="floor")
     sizes = block.unique_consecutive(return_counts=True)[1].tolist()
     for some, number, at in zip(*(values.split(sizes) for values in (head, partners, first)), strict=True):
         which = torch.arange(len(some), device=some.device).repeat_interleave(number)
@@ -330,30 +315,6 @@ def fisher_two_sided(count: Tensor, total: Tensor, successes: Tensor, draws: Ten
     Returns:
         float64 `[K]`.
     """
-    x, n, s, d = (values.double() for values in (count, total, successes, draws))
-    # The lower tail is the upper one of what the draws leave behind: count successes as failures.
-    below = x * n <= s * d
-    x, s = torch.where(below, d - x, x), torch.where(below, n - s, s)
-    tails = [_upper_tail(*part) for part in zip(*(values.split(TAILS_AT_ONCE) for values in (x, n, s, d)), strict=True)]
-    return (2 * torch.cat(tails)).clamp(max=1)
-
-
-def _upper_tail(x: Tensor, n: Tensor, s: Tensor, d: Tensor) -> Tensor:
-    """P(X >= x) for x at or beyond the mean, where the terms fall."""
-    sums, term = torch.ones_like(x), torch.ones_like(x)
-    steps = torch.arange(TERMS, dtype=x.dtype, device=x.device)
-    open_, first = torch.arange(len(x), device=x.device), 0
-    while len(open_):
-        at = x[open_, None] + first + steps
-        ratio = (s[open_, None] - at) * (d[open_, None] - at)
-        ratio = ratio.clamp_(min=0).div_((at + 1) * (n[open_, None] - s[open_, None] - d[open_, None] + at + 1))
-        ratio[:, 0] *= term[open_]
-        terms = ratio.cumprod(1)
-        sums[open_] += terms.sum(1)
-        term[open_] = terms[:, -1]
-        open_, first = open_[terms[:, -1] > PRECISION * sums[open_]], first + TERMS
-    return (_log_choose(s, x) + _log_choose(n - s, d - x) - _log_choose(n, d) + sums.log()).exp()
-
-
-def _log_choose(n: Tensor, k: Tensor) -> Tensor:
-    return torch.lgamma(n + 1) - torch.lgamma(k + 1) - torch.lgamma(n - k + 1)
+    x, n, s, d = (values.cpu().numpy() for values in (count, total, successes, draws))
+    tail = np.where(x * n > s * d, stats.hypergeom.sf(x - 1, n, s, d), stats.hypergeom.cdf(x, n, s, d))
+    return torch.from_numpy(np.minimum(2 * tail, 1)).to(count.device)

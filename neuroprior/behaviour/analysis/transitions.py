@@ -5,13 +5,11 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import torch
-from scipy import stats
 from torch import Tensor
 
 from neuroprior._checks import check_sizes
 from neuroprior._random import generator_on
 from neuroprior.behaviour.analysis.flat import FlatPlans
-from neuroprior.behaviour.analysis.statistics import holm
 from neuroprior.plans import Plans
 
 FEWEST_PERMUTATIONS = 99
@@ -23,7 +21,13 @@ FEWEST_DIVISIONS = 20
 ROUNDING = 1e-12
 """Statistics whose difference is below this share of their terms are tied, as rounding depends on the order of sums."""
 
-Test = Literal["permutation", "chi-square", "none"]
+MAX_WORK = 10**9
+"""Numbers that the permutations may access, some ten seconds on one core; beyond, fewer are made."""
+
+NUMBERS_AT_ONCE = 2**21
+"""Numbers that are in memory at a time."""
+
+Test = Literal["permutation", "none"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,14 +40,13 @@ class Transitions:
         groups: int64 `[G]`: the numbers of the groups, ascending; a single 0 if plans have no groups.
         statistic: the likelihood-ratio statistic of the hypothesis that groups do not differ (Anderson and Goodman
             1957).
-        degrees_of_freedom: of its chi-square distribution.
         p_value: of that statistic; NaN without a test.
         cell_p_values: float64 `[G, A, A]`: for each group and transition, the p-value of the hypothesis that the
             transition has the same probability in this group as in the others, corrected for the number of cells. NaN
             where there is nothing to compare: the first action is never followed by another in this group, or in all
             others; or it is never, or always, followed by the second.
-        test: the origin of the p-values: "permutation" of the groups of whole plans; "chi-square" if there are fewer
-            than `FEWEST_DIVISIONS` ways of dividing the plans into such groups; "none" if no two groups are comparable.
+        test: "permutation" of the groups of whole plans; "none" if there are fewer than `FEWEST_DIVISIONS` ways of
+            dividing the plans into such groups, or if no two groups are comparable.
         permutations: how many were made; 0 without any.
     """
 
@@ -51,7 +54,6 @@ class Transitions:
     group_counts: Tensor
     groups: Tensor
     statistic: float
-    degrees_of_freedom: int
     p_value: float
     cell_p_values: Tensor
     test: Test
@@ -66,14 +68,7 @@ class Transitions:
         return _row_probs(self.group_counts)
 
 
-def transitions(
-    plans: Plans,
-    permutations: int = 999,
-    generator: torch.Generator | None = None,
-    *,
-    max_work: int = 10**9,
-    chunk_size: int = 2**21,
-) -> Transitions:
+def transitions(plans: Plans, permutations: int = 999, generator: torch.Generator | None = None) -> Transitions:
     """The transitions between successive actions within plans, and a test of whether the groups differ in them.
 
     The null distribution is that of the same statistics after the groups of the plans were permuted. Whole plans are
@@ -84,26 +79,19 @@ def transitions(
     does not depend on the counts. It is compared to the largest of all cells in each permutation (Westfall and Young
     1993: single-step maxT).
 
-    With too few plans for that, p-values are those of the chi-square distribution, which assumes a first-order Markov
-    chain (Anderson and Goodman 1957), and cells are corrected by Holm's procedure. That needs many actions in each
-    group; with few, or if the order is higher, it finds differences that do not exist.
-
     Args:
         plans: with a `group`; without, nothing is tested. An end symbol is an action like others.
-        permutations: at most so many; see `max_work`.
+        permutations: at most so many; fewer where they take more than `MAX_WORK`, but at least `FEWEST_PERMUTATIONS`.
         generator: draws the permutations.
-        max_work: numbers that the permutations may access, some ten seconds on one core; fewer are made if need be, but
-            at least `FEWEST_PERMUTATIONS`.
-        chunk_size: numbers that are in memory at a time.
 
     Raises:
-        ValueError: `permutations`, `max_work` or `chunk_size` is below 1.
+        ValueError: `permutations` is below 1.
 
     Example:
         >>> transitions(Plans(torch.tensor([[0, 1, 0, 1, 1]]), 2)).counts.tolist()
         [[0, 2], [1, 1]]
     """
-    check_sizes(permutations=permutations, max_work=max_work, chunk_size=chunk_size)
+    check_sizes(permutations=permutations)
     flat, size = FlatPlans.of(plans), plans.num_actions
     group = torch.zeros(len(plans), dtype=torch.long) if plans.group is None else plans.group.long()
     groups, group = group.to(flat.actions.device).unique(return_inverse=True)
@@ -116,11 +104,8 @@ def transitions(
     test = _which_test(table, group[plan.unique()].bincount())
     if test == "permutation":
         taken = _PlanCounts.of(plan, cell, group, table)
-        made = min(permutations, max(max_work // _cost(table, taken), FEWEST_PERMUTATIONS))
-        p_value, found = _permutation_test(table, taken, made, chunk_size, generator_on(generator, cell.device))
-    elif test == "chi-square":
-        p_value, found = _chi_square_test(table)
-    if test != "none":
+        made = min(permutations, max(MAX_WORK // _cost(table, taken), FEWEST_PERMUTATIONS))
+        p_value, found = _permutation_test(table, taken, made, generator_on(generator, cell.device))
         cells[table.present[:, None], table.cell] = found
     statistic = float("nan") if test == "none" else float(table.overall(table.observed))
     return Transitions(
@@ -128,7 +113,6 @@ def transitions(
         group_counts,
         groups,
         statistic,
-        table.degrees_of_freedom(),
         p_value,
         cells.view(-1, size, size),
         test,
@@ -159,10 +143,6 @@ class _Table(NamedTuple):
     def in_rows(self, values: Tensor) -> Tensor:
         """`[..., R]`: the sums of `values [..., C]` over each row of the transition matrix."""
         return values.new_zeros(*values.shape[:-1], self.rows).index_add_(-1, self.row, values)
-
-    def degrees_of_freedom(self) -> int:
-        groups, followers = (self.in_rows(self.observed) > 0).sum(0), self.row.bincount(minlength=self.rows)
-        return int(((groups - 1) * (followers - 1)).sum())
 
     def comparable(self) -> Tensor:
         """`[G, C]` bool: where neither the group, the others, the transition nor its alternatives are empty."""
@@ -220,12 +200,12 @@ class _PlanCounts(NamedTuple):
 
 def _which_test(table: _Table, plans: Tensor) -> Test:
     """The test for groups of `plans [G]` plans each."""
-    if table.degrees_of_freedom() < 1:
+    if not bool(table.comparable().any()):
         return "none"
     sizes = plans[plans > 0].double()
     same_size = sizes.long().bincount().double()  # exchanging groups of one size gives no new division
     divisions = torch.lgamma(sizes.sum() + 1) - torch.lgamma(sizes + 1).sum() - torch.lgamma(same_size + 1).sum()
-    return "permutation" if float(divisions) > math.log(FEWEST_DIVISIONS - 0.5) else "chi-square"
+    return "permutation" if float(divisions) > math.log(FEWEST_DIVISIONS - 0.5) else "none"
 
 
 def _cost(table: _Table, taken: _PlanCounts) -> int:
@@ -234,12 +214,12 @@ def _cost(table: _Table, taken: _PlanCounts) -> int:
 
 
 def _permutation_test(
-    table: _Table, taken: _PlanCounts, permutations: int, chunk_size: int, generator: torch.Generator
+    table: _Table, taken: _PlanCounts, permutations: int, generator: torch.Generator
 ) -> tuple[float, Tensor]:
     """The p-value of the whole table, and those `[G, C]` of the cells."""
     observed, tie = table.overall(table.observed), table.tie()
     greatest, reached = [], 1
-    together = max(chunk_size // _cost(table, taken), 1)
+    together = max(NUMBERS_AT_ONCE // _cost(table, taken), 1)
     num, device = len(taken.label), taken.label.device
     for at in range(0, permutations, together):
         part = range(at, min(at + together, permutations))
@@ -252,17 +232,6 @@ def _permutation_test(
     above = permutations - torch.searchsorted(ordered, cells - tie)
     corrected = (1 + above).double() / (1 + permutations)
     return reached / (1 + permutations), corrected.masked_fill(~table.comparable(), float("nan"))
-
-
-def _chi_square_test(table: _Table) -> tuple[float, Tensor]:
-    """The p-value of the whole table, and those `[G, C]` of the cells."""
-    p_value = float(stats.chi2.sf(float(table.overall(table.observed)), table.degrees_of_freedom()))
-    comparable = table.comparable()
-    cells = table.cells(table.observed)
-    found = torch.full_like(cells, float("nan"))
-    corrected = holm(stats.chi2.sf(cells[comparable].clamp(min=0).cpu().numpy(), 1))
-    found[comparable] = torch.from_numpy(corrected).to(found)
-    return p_value, found
 
 
 def _n_log_n(counts: Tensor) -> Tensor:

@@ -97,7 +97,7 @@ class DurationModel(SavedModule):
         super().__init__()
         check_sizes(num_actions=num_actions)
         if isinstance(laws, str) or not laws or set(laws) - set(LAW_NAMES):
-            raise ValueError(f"laws: some of {', '.join(LAW_NAMES)} are expected, not {laws!r}")
+            raise ValueError(f"`laws` must be some of {', '.join(LAW_NAMES)}, got {laws!r}.")
         self.num_actions, self.transitions = num_actions, transitions
         self.laws = tuple(law for law in LAW_NAMES if law in laws)
         whole = torch.zeros(num_actions, dtype=torch.long)
@@ -141,7 +141,7 @@ class DurationModel(SavedModule):
         self._check(plans)
         known = self._known(plans)
         if not bool(known.any()):
-            raise ValueError("durations: all of these plans are unknown (NaN); at least one that is known is expected")
+            raise ValueError("`durations` must have one at least that is known, and not NaN.")
         action, after = plans.actions[known].long().cpu(), self._next(plans)[known].cpu()
         time, fold = durations_of(plans)[known].double().cpu(), _parts(plans, known)[known].cpu()
         zeros = time == 0
@@ -307,9 +307,7 @@ class DurationModel(SavedModule):
 
     def _check(self, plans: Plans, durations: bool = True) -> None:
         if plans.num_actions != self.num_actions:
-            raise ValueError(
-                f"plans: {self.num_actions} actions are expected, as this model has, not {plans.num_actions}"
-            )
+            raise ValueError(f"`plans` must have {self.num_actions} actions, as this model, got {plans.num_actions}.")
         if durations:
             durations_of(plans)
 

@@ -63,7 +63,7 @@ class SemiMarkovPrior(Prior):
             contexts = {"num_contexts": num_contexts, "context_size": context_size}
             actions = construct(actions, num_actions, {name: c for name, c in contexts.items() if c is not None})
         if actions.num_actions != num_actions:
-            raise ValueError(f"actions: a prior of {num_actions} actions is expected, not {actions.num_actions}")
+            raise ValueError(f"`actions` must be a prior of {num_actions} actions, got {actions.num_actions}.")
         super().__init__(num_actions, actions.num_contexts, actions.context_size)
         self.actions = actions
         self.durations = DurationModel(num_actions, laws, transitions)

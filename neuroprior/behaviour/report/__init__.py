@@ -8,9 +8,7 @@ Needs pandas, matplotlib, jinja2, joblib and rich (`pip install 'neuroprior[repo
 
 from neuroprior.behaviour.report.document import Document, publish, table
 from neuroprior.behaviour.report.figures import (
-    calibration_figure,
     condition_figure,
-    distribution_figure,
     drift_figure,
     dwell_figure,
     ethogram_figure,
@@ -18,22 +16,21 @@ from neuroprior.behaviour.report.figures import (
     lag_figure,
     motif_figure,
     occupancy_figure,
-    order_figure,
-    raster_figure,
     score_figure,
     transition_figure,
 )
+from neuroprior.behaviour.report.options import FitOptions, ReadOptions
 from neuroprior.behaviour.report.page import FigureBox, Section, Table
 from neuroprior.behaviour.report.plan_report import report
 
 __all__ = [
     "Document",
     "FigureBox",
+    "FitOptions",
+    "ReadOptions",
     "Section",
     "Table",
-    "calibration_figure",
     "condition_figure",
-    "distribution_figure",
     "drift_figure",
     "dwell_figure",
     "ethogram_figure",
@@ -41,9 +38,7 @@ __all__ = [
     "lag_figure",
     "motif_figure",
     "occupancy_figure",
-    "order_figure",
     "publish",
-    "raster_figure",
     "report",
     "score_figure",
     "table",

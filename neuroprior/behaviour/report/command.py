@@ -1,13 +1,16 @@
 """The command that reports on a file of plans: `neuroprior report FILE`, and `python -m eval plans FILE`."""
 
+import inspect
 import shlex
 import sys
 from pathlib import Path
 
+from docstring_parser import parse
 from rich.console import Console
 
 from neuroprior.behaviour.report.document import show
-from neuroprior.behaviour.report.plan_report import INPUTS, InputName, ModelName, report
+from neuroprior.behaviour.report.options import INPUTS, FitOptions, InputName, ModelName, ReadOptions
+from neuroprior.behaviour.report.plan_report import report
 from neuroprior.plans.columns import Columns, Missing
 from neuroprior.priors.ensembles.candidates import Effort
 
@@ -34,15 +37,23 @@ def plans(
     dask: str | None = None,
     out: str = "runs/plans",
 ) -> None:
-    """Print the report on a file of plans, and write it; the options are those of `report`."""
-    options = dict(locals())
+    fits = FitOptions(models, tuple(inputs), modes, effort, folds, max_steps, seed, processes, dask)
+    reading = ReadOptions(columns, missing, merge_repeats, max_gap, num_actions, action_names)
     program, typed = Path(sys.argv[0]).name, sys.argv[1:]
     if typed[:1] not in (["plans"], ["report"]):  # called from Python
         program, typed = "__main__.py", ["plans", plans]
     command = f"{program.replace('__main__.py', 'python -m eval')} {shlex.join(typed)}"
+    document = report(plans, out=out, priors=priors, test=test, skip=skip, fits=fits, reading=reading, command=command)
     console = Console()
-    show(report(**options, command=command), console)
+    show(document, console)
     console.print(f"report: {Path(out) / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
 
 
-plans.__doc__ = report.__doc__
+def _describe_options() -> str:
+    """What the options are for, from the docstrings of the function and the classes that take them."""
+    entries = [entry for one in (report, FitOptions, ReadOptions) for entry in parse(inspect.getdoc(one) or "").params]
+    lines = [f"    {entry.arg_name}: {' '.join((entry.description or '').split())}" for entry in entries]
+    return "\n".join(["Print the report on a file of plans, and write it.", "", "Args:", *lines])
+
+
+plans.__doc__ = _describe_options()

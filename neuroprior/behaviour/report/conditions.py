@@ -1,4 +1,4 @@
-"""The section on conditions: whether behaviour differs between them, in what, and which sequences give them away."""
+"""The section on conditions: whether behaviour differs between them, and in what."""
 
 from collections.abc import Mapping
 
@@ -41,18 +41,17 @@ def condition_section(found: Evaluation) -> Part | None:
     if found.plans.condition is None:
         return None
     result = compare_conditions(found.plans, generator=torch.Generator().manual_seed(0))
-    names = ["condition_tests", "conditions", "condition_blocks", "condition_sequences"]
+    names = ["condition_tests", "conditions", "condition_blocks"]
     if result.prediction is None:
         return Part(Section("Conditions", [result.verdict]), {name: pd.DataFrame() for name in names})
     actions, units = action_names(found.plans), _unit_names(result, found)
     tests, features = _tests(result), _features(result, actions)
-    blocks, sequences = _blocks(result, result.prediction, units), _sequences(result, result.prediction, actions)
-    frames = dict(zip(names, (tests, features, blocks, sequences), strict=True))
+    blocks = _blocks(result, result.prediction, units)
+    frames = dict(zip(names, (tests, features, blocks), strict=True))
     tables = [
         _test_table(result, tests),
         _feature_table(result, features),
         _block_table(result, result.prediction, blocks),
-        _sequence_table(sequences),
     ]
     box = _figure_box(result, features, units)
     return Part(Section("Conditions", _text(result), tables, [box]), frames)
@@ -190,25 +189,6 @@ def _block_table(result: ConditionComparison, prediction: ConditionPrediction, b
         f" permutations (p = {prediction.p_value:.2g}, not corrected)."
     )
     return table(counts, columns, caption, "Condition predicted from sequences")
-
-
-def _sequences(result: ConditionComparison, prediction: ConditionPrediction, actions: list[str]) -> pd.DataFrame:
-    """A row a transition, those first that bring most for the right condition."""
-    pairs = prediction.sequences.tolist()
-    frame = pd.DataFrame({"sequence": [f"{actions[a] if a >= 0 else '(beginning)'} → {actions[b]}" for a, b in pairs]})
-    frame["speaks_for"] = [result.condition_names[label] for label in prediction.speaks_for.tolist()]
-    frame["bits_per_1000"] = 1000 * prediction.carried.numpy()
-    return frame.sort_values("bits_per_1000", ascending=False, kind="stable").reset_index(drop=True)
-
-
-def _sequence_table(sequences: pd.DataFrame) -> Table:
-    columns = {"transition": "sequence", "speaks for": "speaks_for", "bits per\n1,000 actions": "bits_per_1000:+.2f"}
-    shown = sequences[:LISTED]
-    caption = (
-        f"The first {len(shown)} of {len(sequences)}. What each adds to the held-out log odds of the right condition;"
-        " below 0 it misleads."
-    )
-    return table(shown, columns, caption, "Transitions that predict the condition", "llr")
 
 
 def _figure_box(result: ConditionComparison, features: pd.DataFrame, units: list[str]) -> FigureBox:

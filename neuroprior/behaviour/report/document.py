@@ -42,7 +42,6 @@ class Document:
         command: the command line that makes them again.
         results: further JSON values for `results.json`.
         keys: the name in `results.json` of a frame, where it is another.
-        former_names: of columns, which files hold under both names.
 
     Example:
         >>> Document(
@@ -59,7 +58,6 @@ class Document:
     command: str = ""
     results: Mapping[str, Any] = field(default_factory=dict)
     keys: Mapping[str, str] = field(default_factory=dict)
-    former_names: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def tables(self) -> dict[str, pd.DataFrame]:
@@ -70,15 +68,6 @@ class Document:
     def figures(self) -> dict[str, Figure]:
         """The figures by name."""
         return {box.name: box.figure for section in self.sections for box in section.figures}
-
-    @property
-    def written(self) -> dict[str, pd.DataFrame]:
-        """The frames as files hold them, with their columns under former names, too."""
-        former = self.former_names
-        return {
-            name: frame.assign(**{former[column]: frame[column] for column in frame.columns if column in former})
-            for name, frame in self.frames.items()
-        }
 
 
 def publish(document: Document, folder: Path, console: Console | None = None) -> None:
@@ -153,14 +142,14 @@ def write_document(document: Document, folder: Path) -> None:
     earlier = {names.get(key, key) for key, rows in content.items() if isinstance(rows, list)} - {*document.frames}
     write_frames(folder, dict.fromkeys(earlier, pd.DataFrame()))
     write_json(folder / RESULTS, results_of(document))  # before the tables: it says that they are its own
-    write_frames(folder, document.written)
+    write_frames(folder, document.frames)
     shown = {**document.settings, **{f"version: {name}": number for name, number in versions().items()}}
     write_page(folder / PAGE, document.title, document.lead, document.sections, shown, document.command)
 
 
 def results_of(document: Document) -> dict[str, Any]:
     """What `results.json` holds: the rows of each frame, further results, settings and versions."""
-    rows = {document.keys.get(name, name): records(frame) for name, frame in document.written.items()}
+    rows = {document.keys.get(name, name): records(frame) for name, frame in document.frames.items()}
     return {**rows, **document.results, "settings": dict(document.settings), "versions": versions()}
 
 

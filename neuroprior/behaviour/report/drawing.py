@@ -112,16 +112,7 @@ def at_edges(cells: Sequence[Axes], number: int, across: int, below: str, left: 
 def expect_some(name: str, values: Sized) -> None:
     """Raise ValueError where there is nothing to draw."""
     if not len(values):
-        raise ValueError(f"{name}: at least one is expected; without any there is no figure")
-
-
-def expect_columns(name: str, frame: Any, columns: str) -> None:
-    """Raise ValueError unless a table has these columns, which are given with spaces between them."""
-    missing = [column for column in columns.split() if column not in getattr(frame, "columns", ())]
-    if missing:
-        raise ValueError(
-            f"{name}: a table with the columns {', '.join(columns.split())} is expected; {', '.join(missing)} missing"
-        )
+        raise ValueError(f"`{name}` must not be empty: without any there is no figure.")
 
 
 def floats(values: Iterable[Any]) -> Array:

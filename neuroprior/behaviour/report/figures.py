@@ -3,7 +3,7 @@
 Where there is nothing to draw, it is a ValueError.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from textwrap import wrap
 from typing import Any
 
@@ -25,13 +25,11 @@ from neuroprior.behaviour.report.drawing import (
     SPARE,
     WIDTH,
     Array,
-    Number,
     at_edges,
     band,
     colors,
     dot,
     drawn,
-    expect_columns,
     expect_some,
     floats,
     legend,
@@ -51,7 +49,6 @@ MOST_PLANS = 1000  # drawn as points; of more, evenly spaced ones
 MOST_GROUPS = 40  # drawn as a row each; of more, evenly spaced ones between the lowest and the highest
 MOST_DOTS = 200  # units drawn as a dot for each condition; of more, evenly spaced ones
 MOST_PANELS = 12  # groups drawn as a panel each; of more, those that differ most
-MOST_STEPS = 400  # actions of a sequence that are drawn, from its first
 MOST_ROWS = 60  # plans of an ethogram
 MOST_BINS = 1600  # parts of the longest plan of an ethogram, each of which has the colour of one action
 NUMBERED = 8  # actions up to which the cells of a matrix hold their numbers
@@ -111,7 +108,6 @@ def score_figure(scores: pd.DataFrame) -> Figure:
             or "actions and durations"), `bits_per_action`, `low`, `high`; a model may have a row for each input.
     """
     expect_some("scores", scores)
-    expect_columns("scores", scores, "model context bits_per_action low high")
     best = scores.assign(bits=floats(scores["bits_per_action"])).groupby("model", sort=False)["bits"].min()
     models = best.fillna(np.inf).sort_values(ascending=False, kind="stable").index
     figure, (axes,) = panels(1, 1, (WIDTH, 0.9 + 0.36 * max(len(models), 2)))
@@ -155,7 +151,6 @@ def lag_figure(lags: pd.DataFrame) -> Figure:
             `low`, `high`, and `critical_value`, the 95 % quantile of what independent actions would give, or missing.
     """
     expect_some("lags", lags)
-    expect_columns("lags", lags, "what model context lag bits low high critical_value")
     figure, (axes,) = panels(1, 1, (WIDTH, 3.7))
     sizes = np.abs(floats(lags["bits"]))
     sizes = sizes[sizes > 0]
@@ -180,51 +175,6 @@ def lag_figure(lags: pd.DataFrame) -> Figure:
 
 
 @drawn
-def order_figure(orders: pd.DataFrame, scores: pd.DataFrame, ringed: bool = True) -> Figure:
-    """Information criteria and held-out bits against the order of the chain; the least of each is ringed.
-
-    Args:
-        orders: the table `orders` of a report: `order`, `context`, `bic_bits`, `aic_bits`: half the criterion in bits
-            per action, on the scale of the held-out bits.
-        scores: the table `plans`, of which the rows of Markov chains are drawn: see `score_figure`.
-        ringed: False where there are too few independent units for a verdict.
-    """
-    expect_columns("orders", orders, "order context bic_bits aic_bits")
-    expect_columns("scores", scores, "model context bits_per_action low high")
-    figure, (axes,) = panels(1, 1, (WIDTH, 3.7))
-    styles = iter(("--", ":", "-.", (0, (5, 1, 1, 1, 1, 1))))
-    for inputs, own in orders.groupby("context", sort=False):
-        for criterion in ("BIC", "AIC"):
-            rows = own.assign(none=None)[["order", f"{criterion.lower()}_bits", "none", "none"]]
-            band(axes, rows.to_numpy(), INK, criterion + ", with context" * ("context" in str(inputs)), next(styles))
-    chains = chain_scores(scores)
-    curves = {f"held out, {inputs}": own for inputs, own in chains.groupby("context", sort=False)}
-    for (name, own), (color, line) in zip(curves.items(), lines(list(curves)), strict=True):
-        band(axes, own[["order", "bits_per_action", "low", "high"]].to_numpy(), color, name, line)
-    lows, tops = [], []
-    for curve in [curve for curve in axes.lines if np.isfinite(curve.get_ydata()).any()]:
-        order, bits = np.asarray(curve.get_data(), dtype=np.float64)
-        least = int(np.nanargmin(bits))
-        if ringed:
-            axes.plot(order[least], bits[least], "o", ms=13, mfc="none", mec=curve.get_color(), mew=1.3)
-        lows.append(bits[least])
-        tops.append(max(np.nanmax(bits[: least + 1]), 1.05 * bits[least]))
-    if lows:
-        # A criterion climbs without end with the number of parameters; that it leaves the figure says enough.
-        reach = 1.2 * (max(tops) - min(lows))
-        axes.set_ylim(min(lows) - 0.1 * reach, min(axes.get_ylim()[1], min(lows) + reach))
-    whole_numbers(axes, "order", "bits per action")
-    legend(figure, axes.get_legend_handles_labels()[0])
-    return figure
-
-
-def chain_scores(scores: pd.DataFrame) -> pd.DataFrame:
-    """The rows of Markov chains in the table `plans` of a report, with their `order`, ascending."""
-    order = scores["model"].str.extract(r"^markov-(\d+)$")[0]
-    return scores[order.notna()].assign(order=order.dropna().astype(int)).sort_values("order", kind="stable")
-
-
-@drawn
 def dwell_figure(dwell: pd.DataFrame) -> Figure:
     """How long actions take, a panel an action: a histogram on a logarithmic axis with the law that was fitted.
 
@@ -236,7 +186,6 @@ def dwell_figure(dwell: pd.DataFrame) -> Figure:
             unit of the natural logarithm.
     """
     expect_some("dwell", dwell)
-    expect_columns("dwell", dwell, "action number zero law low high density fitted")
     actions = list(dict(iter(dwell.groupby("action", sort=False))).items())
     shown = sorted(actions, key=lambda item: -int(item[1]["number"].iloc[0]))[:MOST_PANELS]
     across = min(len(shown), 3)
@@ -268,33 +217,6 @@ def _decades(axes: Axes, low: float, high: float) -> None:
     axes.xaxis.set_major_locator(LogLocator(subs=steps, numticks=6))
     axes.xaxis.set_major_formatter(DIGITS)
     axes.minorticks_off()
-
-
-@drawn
-def calibration_figure(calibration: pd.DataFrame) -> Figure:
-    """The share of actions that were taken against the forecast probability, a panel a model; the diagonal is right.
-
-    Args:
-        calibration: the table of a report: `model`, `context`, `forecast` (the mean of a bin), `taken` (the share),
-            `low`, `high`, and `number` of forecasts; larger points hold more.
-    """
-    expect_some("calibration", calibration)
-    expect_columns("calibration", calibration, "model context forecast taken low high number")
-    curves = dict(iter(calibration.groupby(model_names(calibration), sort=False)))
-    across = min(len(curves), 3)
-    down = -(-len(curves) // across)
-    figure, cells = panels(down, across, (2.45 * across + 0.15, 2.65 * down + 0.3))
-    for axes, (name, own), color in zip(cells, curves.items(), colors(list(curves)), strict=False):
-        number = floats(own["number"])
-        axes.plot([0, 1], [0, 1], color=INK, lw=0.8, alpha=0.6)
-        axes.vlines(floats(own["forecast"]), floats(own["low"]), floats(own["high"]), color=color, lw=1.8)
-        size = 8 + 70 * np.sqrt(number / max(number.max(initial=0), 1))
-        axes.scatter(floats(own["forecast"]), floats(own["taken"]), s=size, color=color, lw=0, zorder=3)
-        axes.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), aspect="equal", title=short(name))
-        axes.set(xticks=[0, 0.5, 1], yticks=[0, 0.5, 1])
-        axes.grid()
-    at_edges(cells, len(curves), across, "forecast probability", "share taken")
-    return figure
 
 
 @drawn
@@ -380,8 +302,6 @@ def condition_figure(means: pd.DataFrame, values: pd.DataFrame, paired: bool = F
         paired: each unit is under every condition: lines join its dots.
     """
     expect_some("means", means)
-    expect_columns("means", means, "feature condition mean low high")
-    expect_columns("values", values, "feature unit condition value")
     conditions = list(means["condition"].unique())
     features = list(means["feature"].unique())
     height = 0.62 + (0.36 if paired else 0.26) * len(conditions)
@@ -415,7 +335,6 @@ def motif_figure(motifs: pd.DataFrame) -> Figure:
             `count`; drawn from the top down.
     """
     expect_some("motifs", motifs)
-    expect_columns("motifs", motifs, "sequence ratio low high count")
     names = ["\n".join(wrap(clean(name), 36, max_lines=4, placeholder=" …")) for name in motifs["sequence"]][::-1]
     heights = np.array([0.5 + 0.5 * (1 + name.count("\n")) for name in names])
     figure, (axes,) = panels(1, 1, (WIDTH, 0.9 + 0.3 * max(heights.sum(), 2)))
@@ -436,37 +355,6 @@ def motif_figure(motifs: pd.DataFrame) -> Figure:
     names_down(axes, names, places)
     axes.set_ylim(0, heights.sum())
     axes.set_xlabel("times as often as expected")
-    return figure
-
-
-@drawn
-def raster_figure(real: ArrayLike, generated: ArrayLike, names: Sequence[str]) -> Figure:
-    """Sequences as strips of colour, one colour an action: real ones above, generated ones below.
-
-    Args:
-        real: `[n, T]`, action numbers; negative ones stand for no action. The first `MOST_STEPS` are drawn.
-        generated: `[m, T']`, likewise.
-        names: of the actions, by number.
-    """
-    both = [np.asarray(actions, dtype=np.int64)[:, :MOST_STEPS] for actions in (real, generated)]
-    count = sum(np.bincount(actions[actions >= 0], minlength=len(names)) for actions in both)
-    palette, keys, columns = _strip_colors(count, names)
-    heights = [0.16 * max(len(actions), 1) + 0.25 for actions in both]
-    size = (WIDTH, sum(heights) + 0.7 + 0.22 * -(-len(keys) // columns))
-    longest = max(actions.shape[1] for actions in both)
-    figure, cells = panels(2, 1, size, sharex=True, height_ratios=heights)
-    for axes, actions, title in zip(cells, both, ("real", "generated"), strict=True):
-        strips = np.repeat(palette[np.where(actions < 0, len(names), actions)], 5, axis=0)
-        # A gap between the strips of two sequences.
-        strips[4::5, :, 3] = 0
-        extent = (0.5, actions.shape[1] + 0.5, len(actions) - 0.5, -0.5)
-        axes.imshow(strips, aspect="auto", interpolation="none", extent=extent)
-        axes.set(yticks=[], xlim=(0.5, longest + 0.5))
-        axes.set_title(title, loc="left")
-        axes.spines[:].set_visible(False)
-    cut = max(np.shape(real)[1], np.shape(generated)[1]) > MOST_STEPS
-    cells[1].set_xlabel("action of the sequence" + f" (the first {MOST_STEPS})" * cut)
-    figure.legend(handles=keys, loc="outside lower left", ncols=columns, fontsize=9, handlelength=1, columnspacing=1.4)
     return figure
 
 
@@ -494,7 +382,7 @@ def ethogram_figure(plans: Plans) -> Figure:
     plans = plans if plans.end is None else plans.without_end()
     mask = plans.mask().cpu().numpy()
     if not mask.any():
-        raise ValueError("plans: at least one action is expected; without any there is no figure")
+        raise ValueError("`plans` must have at least one action: without any there is no figure.")
     names = action_names(plans)
     count = plans.actions.cpu()[torch.from_numpy(mask)].long().bincount(minlength=len(names)).numpy()
     palette, keys, columns = _strip_colors(count, names)
@@ -597,38 +485,12 @@ def _strip_colors(count: Any, names: Sequence[str]) -> tuple[Array, list[Patch],
 
 
 @drawn
-def distribution_figure(distributions: Mapping[str, tuple[Sequence[Number], Sequence[Number]]]) -> Figure:
-    """Distributions of lengths in real and in generated sequences, a panel each, on a logarithmic axis.
-
-    Args:
-        distributions: by what the length is of, such as "run length, actions": the shares of the lengths 1, 2, 3 and
-            so on, real and generated. Lengths that never occur are left out.
-    """
-    expect_some("distributions", distributions)
-    figure, cells = panels(1, len(distributions), (WIDTH if len(distributions) > 1 else 5, 3.2))
-    for axes, (name, pair) in zip(cells, distributions.items(), strict=True):
-        for shares, label, color, line in zip(pair, ("real", "generated"), (INK, MORE), ("-", "--"), strict=True):
-            share = floats(shares)
-            lengths = np.arange(1, len(share) + 1)[share > 0]
-            axes.plot(lengths, share[share > 0], line, color=color, marker=".", ms=5, lw=1.4, label=label)
-        axes.set_yscale("log")
-        if np.divide(*axes.get_ylim()) > 0.01:
-            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.yaxis.set_major_formatter(DIGITS)
-        axes.minorticks_off()
-        whole_numbers(axes, clean(name), "share")
-    legend(figure, cells[0].get_legend_handles_labels()[0])
-    return figure
-
-
-@drawn
 def occupancy_figure(occupancy: pd.DataFrame) -> Figure:
     """The share of each hidden mode over the parts of plans, with bands.
 
     Args:
         occupancy: columns `mode`, `part` (from 1), `share`, `low`, `high`.
     """
-    expect_columns("occupancy", occupancy, "mode part share low high")
     expect_some("occupancy", occupancy)
     figure, (axes,) = panels(1, 1, (WIDTH, 2.8))
     names = list(occupancy["mode"].unique())
@@ -651,8 +513,6 @@ def drift_figure(drift: pd.DataFrame, plans: pd.DataFrame) -> Figure:
             drawn, the one that takes the most bits at the top.
         plans: `index` of a plan in its group, `bits` per action; at most `MOST_PLANS` are drawn.
     """
-    expect_columns("drift", drift, "what name bits low high")
-    expect_columns("plans", plans, "index bits")
     parts, groups = (drift[drift["what"] == what] for what in ("place", "group"))
     ranked = groups[groups["bits"].notna()].sort_values("bits", kind="stable")
     ranked = ranked.iloc[_evenly(len(ranked), MOST_GROUPS)]

@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from math import log
 from typing import Any
 
 import numpy as np
@@ -11,10 +10,9 @@ import torch
 from torch import Tensor
 
 from neuroprior._version import __version__
-from neuroprior.behaviour.analysis.calibration import Reliability, reliability
-from neuroprior.behaviour.analysis.comparison import Score, action_bits, baselines, score_bits, units
+from neuroprior.behaviour.analysis.comparison import Score, action_bits, baselines, score_bits
 from neuroprior.behaviour.analysis.lags import pieces
-from neuroprior.plans import Plans, constant_context
+from neuroprior.plans import Plans
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, fair_split, folds, num_units
 from neuroprior.plans.past_durations import PastDurations
 from neuroprior.priors import CombinedPrior, GRUPrior, MarkovPrior, Prior, StackedPrior, TransformerPrior
@@ -23,8 +21,6 @@ from neuroprior.priors.counts import TooLargeError
 from neuroprior.priors.ensembles import candidates
 from neuroprior.priors.ensembles.candidates import Effort, fitted_experts, number_tried
 from neuroprior.priors.ensembles.mixture import divided
-from neuroprior.sampling.ancestral import sample, sample_in_world
-from neuroprior.worlds import TabularWorld
 
 Arrays = dict[str, np.ndarray[Any, Any]]
 
@@ -56,8 +52,7 @@ VALIDATION = 0.1
 """Share of the training plans on which the settings of count-based models are chosen."""
 
 MOST_PIECES, PIECES_A_STEP = 20_000, 128
-MOST_GENERATED = 1000
-"""Bounds of what is cut into pieces, read in a step, and sampled."""
+"""Bounds of what is cut into pieces, and of what is read in a step of training."""
 
 
 @dataclass(frozen=True)
@@ -119,14 +114,12 @@ def fit_and_score(plans: Plans, test: Plans | None, design: Design, job: Job) ->
 
     Returns:
         Arrays by the name of the model and what they are, such as "gru/bits". "how": its settings. "bits" `[n, L]`,
-        float32: those of each held-out action. "calibration": the sums of a `Reliability`. In the first fold,
-        "generated" `[g, L]`: plans sampled from it. Or, of `LAGS`, "bits" and "actions" `[J, U]`: those of the
-        same actions with 0, 1, ... J - 1 past ones known, by independent unit.
+        float32: those of each held-out action. Or, of `LAGS`, "bits" and "actions" `[J, U]`: those of the same actions
+        with 0, 1, ... J - 1 past ones known, by independent unit.
     """
     learned, index = split(plans, test, design, job.fold)
     whole = plans if test is None else test
-    mask = counted(whole, design.skip, design.cut)
-    unit, scored = units(whole, mask)[index], whole[index]
+    scored = whole[index]
     if job.inputs != CONTEXT:
         learned, scored = (some.without_context() for some in (learned, scored))
     if job.inputs == DURATIONS:
@@ -136,32 +129,9 @@ def fit_and_score(plans: Plans, test: Plans | None, design: Design, job: Job) ->
     if job.kind in LAGS:
         return _by_lag(job.kind, learned, scored, design, seed)
     found: Arrays = {}
-    world = None if job.fold else _world(learned, context_arguments(learned, scored).get("num_contexts", 0))
     for name, how, prior in _fitted(job.kind, learned, scored, design, seed):
-        arrays = {"how": np.array(how)} | score_arrays(prior, scored, mask[index], unit)
-        if job.fold == 0:
-            generated = _generated(prior, scored, world, seed)
-            arrays |= {} if generated is None else {"generated": generated.numpy()}
-        found |= {f"{name}/{what}": array for what, array in arrays.items()}
+        found |= {f"{name}/how": np.array(how), f"{name}/bits": action_bits(prior, scored).float().numpy()}
     return found
-
-
-def score_arrays(prior: Prior, scored: Plans, mask: Tensor, unit: Tensor) -> Arrays:
-    """The bits of each action of plans, and the calibration over their units; see `fit_and_score`."""
-    bits = torch.zeros(scored.actions.shape)
-    total: Reliability | None = None
-    at = 0
-    with torch.no_grad():
-        for part, log_probs in prior.forecasts(scored):
-            rows = slice(at, at + len(part))
-            at += len(part)
-            taken = log_probs.gather(-1, part.actions.long()[..., None])[..., 0]
-            bits[rows] = -taken.masked_fill(~part.mask(), 0) / log(2)
-            counts = mask[rows]
-            if counts.any():
-                one = reliability(log_probs[counts], part.actions[counts].long(), unit[rows][counts])
-                total = one if total is None else total + one
-    return {"bits": bits.numpy()} | ({} if total is None else {"calibration": total.sums.numpy()})
 
 
 def _fitted(kind: str, learned: Plans, scored: Plans, design: Design, seed: int) -> Iterator[tuple[str, str, Prior]]:
@@ -243,36 +213,3 @@ def _of_last(prior: Prior, held_out: Plans, known: int) -> Score:
     length = held_out.max_length
     bits = action_bits(prior, replace(held_out.steps(length - known - 1), lengths=None))
     return score_bits("", "", bits[:, -1:], replace(held_out.steps(length - 1), lengths=None))
-
-
-def _world(learned: Plans, num_contexts: int) -> TabularWorld | None:
-    """How the context of a step follows from the one before and the action there, where these alone decide it."""
-    context, actions = learned.context, learned.num_actions
-    if context is None or context.is_floating_point() or constant_context(learned) is not None:
-        return None
-    goes_on = learned.mask()[:, 1:]
-    pair = (context.long() * actions + learned.actions.long())[:, :-1][goes_on]
-    after = context[:, 1:][goes_on].long()
-    table = torch.arange(num_contexts).repeat_interleave(actions)
-    table[pair] = after
-    if not bool((table[pair] == after).all()) or len(pair) == 0:
-        return None
-    legal_actions = torch.zeros(num_contexts * actions, dtype=torch.bool)
-    legal_actions[pair] = True
-    legal_actions = legal_actions.view(num_contexts, actions)
-    legal_actions[~legal_actions.any(1)] = True
-    return TabularWorld(table.view(num_contexts, actions), torch.zeros(1, num_contexts), legal_actions)
-
-
-def _generated(prior: Prior, scored: Plans, world: TabularWorld | None, seed: int) -> Tensor | None:
-    """A plan sampled in the place of each of the first held-out plans, as long; None where contexts are unknown."""
-    like, generator = scored[:MOST_GENERATED], torch.Generator().manual_seed(seed)
-    if not prior.takes_context:
-        return sample(prior, len(like), like.max_length, generator=generator)
-    assert like.context is not None
-    once = constant_context(like)
-    if once is not None:
-        return sample(prior, len(like), like.max_length, once, generator=generator)
-    if world is None or like.max_length == 0:
-        return None
-    return sample_in_world(prior, world, like.context[:, 0].long(), 1, like.max_length, generator=generator)[0][:, 0]

@@ -58,11 +58,6 @@ SMALLEST = 9.5
 """Height of the smallest text of a figure, CSS pixels, down to which it shrinks with the page; then its box scrolls."""
 
 
-def breakable(name: str) -> str:
-    """A long name, which may be broken where its words end."""
-    return name.replace("_", "_\N{ZERO WIDTH SPACE}")
-
-
 @dataclass(frozen=True)
 class Table:
     """A table of text, with K columns.
@@ -92,11 +87,11 @@ class Table:
         wide = len(self.headings)
         for number, row in enumerate(self.rows):
             if len(row) != wide:
-                raise ValueError(f"rows[{number}]: {wide} cells are expected, one a heading, not {len(row)}")
+                raise ValueError(f"`rows[{number}]` must have {wide} cells, one a heading, got {len(row)}.")
         if self.align is None:
             object.__setattr__(self, "align", "l" + "r" * (wide - 1))
         elif len(self.align) != wide or set(self.align) - set("lr"):
-            raise ValueError(f"align: {wide} letters l or r are expected, not {self.align!r}")
+            raise ValueError(f"`align` must be {wide} letters l or r, got {self.align!r}.")
 
 
 @dataclass(frozen=True)

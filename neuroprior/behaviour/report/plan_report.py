@@ -4,32 +4,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Any
 
 import torch
 
-from neuroprior._checks import check_count, check_sizes
+from neuroprior._checks import check_count
 from neuroprior._jobs import Progress
 from neuroprior._threads import one_thread
 from neuroprior.behaviour.report.document import Document, check_place, write_document
 from neuroprior.behaviour.report.fits import ACTIONS, CONTEXT, DURATIONS, LAGS, OF_FEATURES, Design, counted
+from neuroprior.behaviour.report.options import FitOptions, ReadOptions, check_choices
 from neuroprior.behaviour.report.scores import Evaluation, cross_validation, evaluate, evaluate_saved, jobs
 from neuroprior.behaviour.report.sections import SECTIONS, describe
-from neuroprior.plans import Plans, read_plans
-from neuroprior.plans.columns import Columns, Missing
+from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
 from neuroprior.plans.io import is_table
 from neuroprior.priors import Prior, load
-from neuroprior.priors.ensembles.candidates import Effort, check_effort
 from neuroprior.priors.matching import learned_names, renumbered
 from neuroprior.priors.scoring import learned_from
-
-ModelName = Literal["counts", "gru", "transformer", "stacked", "combined"]
-InputName = Literal["actions", "context", "durations"]
-
-MODELS: tuple[ModelName, ...] = ("counts", "gru", "transformer", "stacked", "combined")
-QUICK: tuple[ModelName, ...] = ("counts", "gru", "combined")
-INPUTS: tuple[InputName, ...] = ("actions", "context", "durations")
 
 MOST_ACTIONS = 10_000
 """Kinds of actions beyond which they are thought to be names that look like numbers."""
@@ -44,22 +36,9 @@ def report(
     out: str | Path | None = None,
     priors: Mapping[str, Prior] | Sequence[str] | None = None,
     test: Plans | str | Path | None = None,
-    folds: int | None = None,
-    models: Sequence[ModelName] | None = None,
-    inputs: Sequence[InputName] = INPUTS[:2],
-    modes: Sequence[int] | None = None,
     skip: int = 0,
-    effort: Effort = "standard",
-    max_steps: int | None = None,
-    num_actions: int | None = None,
-    action_names: Sequence[str] | None = None,
-    columns: Columns | Mapping[str, Any] | None = None,
-    missing: Missing = "gap",
-    merge_repeats: bool = False,
-    max_gap: float | None = None,
-    seed: int = 0,
-    processes: int | None = None,
-    dask: str | None = None,
+    fits: FitOptions = FitOptions(),  # noqa: B008
+    reading: ReadOptions | None = None,
     sections: Sequence[str] = tuple(SECTIONS),
     command: str = "",
 ) -> Document:
@@ -71,29 +50,9 @@ def report(
             which an interrupted one goes on; None: nothing is written.
         priors: score these fitted priors only, given by name or by their folders; the first is the reference.
         test: learn from the plans and score on these, or on those of this file, in place of cross-validation.
-        folds: of the cross-validation over groups (over plans, where there are no two groups); 5 by default.
-        models: which to fit: counts (uniform, Markov chains, context trees), gru, transformer, stacked (a GRU that
-            weighs the forecasts of counts), combined (of what `effort` says, which is fitted for it). By default all;
-            with effort fast counts, gru and combined.
-        inputs: of the models: past actions alone; the context as well, where the plans have one; of gru, transformer
-            and combined, durations: how long the last action took, beside the actions. Each in turn; durations, with
-            which these take as long again, are left out by default.
-        modes: numbers of hidden modes that are tried, such as `[1, 2, 3]`; None: no section on modes, which takes about
-            as long for each number as the counts.
         skip: actions at the beginning of each plan that do not count in scores.
-        effort: how much the combined prior spends on networks: fast (a GRU), standard (and a stacked prior) or full
-            (and a transformer and a switching network).
-        max_steps: gradient steps of a neural prior; None: by the plans, see `neuroprior.training.Settings`.
-        num_actions: number of actions, where a file does not say.
-        action_names: names of the actions in the order of their numbers, where a file does not say.
-        columns: which columns of a CSV file hold what: action, plan, context, group, condition, start, stop, duration,
-            event_type.
-        missing: what rows without a label do: a gap ends the plan; as label they count as an action; or error.
-        merge_repeats: take the same label in successive rows for one action, as in files with a row a frame.
-        max_gap: a longer pause between two actions ends the plan, too; in the unit of the starts.
-        seed: draws the folds and everything in training.
-        processes: how many models are fitted at a time; all cores by default.
-        dask: address of a Dask scheduler whose workers fit the models; None: this machine.
+        fits: which models are fitted, and how.
+        reading: how files are read; None for plans in memory.
         sections: which to make, of `neuroprior.behaviour.report.sections.SECTIONS`; all by default.
         command: the command line that makes the report again, for the page.
 
@@ -107,102 +66,112 @@ def report(
 
     Example:
         >>> plans = Plans(torch.randint(3, (20, 30), generator=torch.Generator().manual_seed(0)).sort(1).values, 3)
-        >>> found = report(plans, models=["counts"], sections=["transitions"], folds=2, processes=1)
+        >>> fits = FitOptions(models=["counts"], folds=2, processes=1)
+        >>> found = report(plans, fits=fits, sections=["transitions"])
         >>> list(found.figures)
         ['transitions']
     """
-    check_effort(effort)
-    given_models = models
-    models = (QUICK if effort == "fast" else MODELS) if models is None else models
-    for name, given, known in (
-        ("models", models, MODELS),
-        ("inputs", inputs, INPUTS),
-        ("sections", sections, SECTIONS),
-    ):
-        if isinstance(given, str):
-            raise ValueError(f"{name}: a list is expected, such as [{given!r}], not a text")
-        if not given or set(given) - set(known):
-            raise ValueError(f"{name}: some of {', '.join(known)} are expected, not {', '.join(given) or 'none'}")
-    if effort != "standard" and "combined" not in models:
-        raise ValueError("effort: for the combined prior alone; add combined to models, or leave effort out")
-    _check(skip, max_steps, seed, processes)
-    for number in modes or ():
-        check_sizes(modes=number)
+    check_choices("sections", sections, tuple(SECTIONS))
+    check_count("skip", skip, 0)
+    if reading is not None and isinstance(plans, Plans) and not isinstance(test, str | Path):
+        raise ValueError("`reading` must be left out for plans in memory.")
+    reading = reading or ReadOptions()
     file = "" if isinstance(plans, Plans) else str(plans)
     if out is not None:
         check_place(Path(out), ["plans"] if "scores" in sections else [])  # before hours of work
-    reading: dict[str, Any] = {"num_actions": num_actions, "action_names": action_names, "columns": columns}
-    reading |= {"missing": missing, "merge_repeats": merge_repeats, "max_gap": max_gap}
-    if priors is not None:
-        of_fits: dict[str, Any] = {
-            "test": test,
-            "folds": folds,
-            "models": given_models,
-            "modes": modes,
-            "max_steps": max_steps,
-            "inputs": None if tuple(inputs) == INPUTS[:2] else inputs,
-            "effort": None if effort == "standard" else effort,
-        }
-        if without := [name for name, value in of_fits.items() if value is not None]:
-            raise ValueError(f"priors: they are scored on the plans as they are; leave {', '.join(without)} out")
-        if isinstance(priors, Prior | str) or any(isinstance(one, Prior) for one in priors):
-            raise ValueError("priors: a dict of fitted priors by name, or a list of folders, is expected")
-        if not priors:
-            raise ValueError("priors: at least one is expected")
-        loaded = dict(priors) if isinstance(priors, Mapping) else {folder: load(folder) for folder in priors}
-        table = is_table(file)
-        names = action_names or (learned_names(next(iter(loaded.values()))) if table else None)
-        found = evaluate_saved(loaded, _read(plans, reading | {"action_names": names}), skip, table)
-        same = {} if isinstance(priors, Mapping) else {one: sum(learned_from(Path(one), found.plans)) for one in priors}
-        if any(same.values()):
-            found = replace(found, settings=found.settings | {"training data": {k: n for k, n in same.items() if n}})
+    if priors is None:
+        found = _cross_validate(plans, test, skip, fits, reading, out, "lags" in sections)
     else:
-        whole, empty = _with_actions(plans, reading)
-        other, cut = None, False
-        if test is not None:
-            if not isinstance(test, Plans) and file and Path(test).resolve() == Path(file).resolve():
-                raise ValueError("test: the very plans that are learned from; give others, or leave it out")
-            if folds is not None:
-                raise ValueError("folds: with test plans nothing is held out of the others; leave folds out")
-            other, empty = _with_actions(test, reading)
-            other = _numbered_alike(whole, other, "test" if isinstance(test, Plans) else str(test))
-        whole, other = _contexts_from_0(whole, other)
-        learned, cut = _in_parts(whole)
-        if other is not None:
-            other, cut = _in_parts(other)
-        number = 1 if other is not None else _folds(file or "plans", learned, folds)
-        design = Design(number, seed, skip, max_steps, effort, cut=cut)
-        kinds: list[str] = [*models]
-        if "lags" in sections:
-            kinds += LAGS if set(models) != {"counts"} else LAGS[:1]
-        given = [ACTIONS] * ("actions" in inputs) + [CONTEXT] * ("context" in inputs and learned.context is not None)
-        if "durations" in inputs:
-            if any(some.durations is None for some in (learned, other) if some is not None):
-                raise ValueError("inputs: the plans have no durations; leave durations out")
-            if not set(kinds) & set(OF_FEATURES):
-                raise ValueError(f"inputs: durations are an input of {', '.join(OF_FEATURES)}; add one to models")
-            given.append(DURATIONS)
-        if not given:
-            raise ValueError("inputs: the plans have no context; leave context out")
-        left = int(counted(learned if other is None else other, skip, cut).sum())
-        if left < FEWEST_UNITS:
-            raise ValueError(f"skip: {left} actions are left to score after the first {skip} of each plan")
-        if out is not None:
-            Path(out).mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory() as temporary:
-            run = cross_validation(Path(out or temporary), learned, other, design)
-            todo = jobs(design, kinds, given)
-            results = run.do(todo, processes=processes, dask=dask, title="fits")
-        found = evaluate(learned, other, design, todo, results)
-        settings: dict[str, Any] = {"models": ", ".join(kinds)} | found.settings
-        settings |= {} if modes is None else {"modes": sorted(set(modes))}
-        settings |= {"plans without actions, left out": empty} if empty else {}
-        settings |= {} if test is None else {"test": str(test) if not isinstance(test, Plans) else "plans"}
-        found = replace(found, plans=whole, settings=settings)
+        if given := fits.changed() + ["test"] * (test is not None):
+            names = ", ".join(f"`{name}`" for name in given)
+            raise ValueError(f"{names} must be left out where `priors` are given, which are not fitted.")
+        found = _score_saved(plans, priors, skip, reading)
     document = _document(found, sections, file, command)
     if out is not None:
         write_document(document, Path(out))
     return document
+
+
+def _score_saved(
+    plans: Plans | str | Path, priors: Mapping[str, Prior] | Sequence[str], skip: int, reading: ReadOptions
+) -> Evaluation:
+    """Score fitted priors on plans, and note which of these they have learned from."""
+    if isinstance(priors, Prior | str) or not priors or any(isinstance(one, Prior) for one in priors):
+        raise ValueError("`priors` must be a dict of fitted priors by name, or a list of folders, with one at least.")
+    loaded = dict(priors) if isinstance(priors, Mapping) else {folder: load(folder) for folder in priors}
+    table = not isinstance(plans, Plans) and is_table(str(plans))
+    if table and reading.action_names is None:
+        reading = replace(reading, action_names=learned_names(next(iter(loaded.values()))))
+    found = evaluate_saved(loaded, _read(plans, reading), skip, table)
+    known = {} if isinstance(priors, Mapping) else {one: sum(learned_from(Path(one), found.plans)) for one in priors}
+    if not any(known.values()):
+        return found
+    return replace(found, settings=found.settings | {"training data": {name: n for name, n in known.items() if n}})
+
+
+def _cross_validate(
+    plans: Plans | str | Path,
+    test: Plans | str | Path | None,
+    skip: int,
+    fits: FitOptions,
+    reading: ReadOptions,
+    out: str | Path | None,
+    with_lags: bool,
+) -> Evaluation:
+    """Fit models to plans, and score them on those held out, or on `test`; finished fits are kept in `out`."""
+    if test is not None and fits.folds is not None:
+        raise ValueError("`folds` must be left out where there are `test` plans, for which nothing is held out.")
+    whole, empty = _with_actions(plans, reading)
+    other, cut = None, False
+    if test is not None:
+        files = [Path(one).resolve() for one in (plans, test) if not isinstance(one, Plans)]
+        if len(files) == 2 and files[0] == files[1]:
+            raise ValueError(f"`test` must be other plans than those that are learned from, got {test}.")
+        other, empty = _with_actions(test, reading)
+        other = _numbered_alike(whole, other, "test" if isinstance(test, Plans) else str(test))
+    whole, other = _contexts_from_0(whole, other)
+    learned, cut = _in_parts(whole)
+    if other is not None:
+        other, cut = _in_parts(other)
+    scored = learned if other is None else other
+    number = 1 if other is not None else _folds("plans" if isinstance(plans, Plans) else str(plans), learned, fits)
+    design = Design(number, fits.seed, skip, fits.max_steps, fits.effort, cut=cut)
+    kinds: list[str] = [*fits.kinds]
+    if with_lags:
+        kinds += LAGS if set(kinds) != {"counts"} else LAGS[:1]
+    inputs = _inputs(fits, kinds, learned, scored)
+    left = int(counted(scored, skip, cut).sum())
+    if left < FEWEST_UNITS:
+        raise ValueError(
+            f"`skip` must leave at least {FEWEST_UNITS} actions to score, got {skip}, which leaves {left}."
+        )
+    if out is not None:
+        Path(out).mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory() as temporary:
+        run = cross_validation(Path(out or temporary), learned, other, design)
+        todo = jobs(design, kinds, inputs)
+        results = run.do(todo, processes=fits.processes, dask=fits.dask, title="fits")
+    found = evaluate(learned, other, design, todo, results)
+    settings: dict[str, Any] = {"models": ", ".join(kinds)} | found.settings
+    settings |= {} if fits.modes is None else {"modes": sorted(set(fits.modes))}
+    settings |= {"plans without actions, left out": empty} if empty else {}
+    settings |= {} if test is None else {"test": "plans" if isinstance(test, Plans) else str(test)}
+    return replace(found, plans=whole, settings=settings)
+
+
+def _inputs(fits: FitOptions, kinds: Sequence[str], learned: Plans, scored: Plans) -> list[str]:
+    """The inputs that plans have of those that are asked for."""
+    found = [ACTIONS] * ("actions" in fits.inputs)
+    found += [CONTEXT] * ("context" in fits.inputs and learned.context is not None)
+    if "durations" in fits.inputs:
+        if learned.durations is None or scored.durations is None:
+            raise ValueError("`inputs` must not hold durations where plans have none.")
+        if not set(kinds) & set(OF_FEATURES):
+            raise ValueError(f"`models` must hold one of {', '.join(OF_FEATURES)}, of which durations are an input.")
+        found.append(DURATIONS)
+    if not found:
+        raise ValueError("`inputs` must hold more than the context where plans have none.")
+    return found
 
 
 def _document(found: Evaluation, sections: Sequence[str], file: str, command: str) -> Document:
@@ -213,7 +182,6 @@ def _document(found: Evaluation, sections: Sequence[str], file: str, command: st
             part = SECTIONS[name](found)
             made += [] if part is None else [part]
             progress.advance(name)
-    facts = describe(found.plans)
     return Document(
         title=f"Plans in {Path(file).name}" if file else "Plans",
         lead=" ".join([_lead(found), *(part.section.text[0] for part in made if part.section.title == "Conditions")]),
@@ -224,10 +192,9 @@ def _document(found: Evaluation, sections: Sequence[str], file: str, command: st
         results={
             "reference": found.reference[1],
             "unit": found.unit,
-            "file": {"name": file, **facts, "sees": facts["context"]},
+            "file": {"name": file, **describe(found.plans)},
         },
         keys={"plans": "rows"},
-        former_names={"context": "sees"},
     )
 
 
@@ -249,28 +216,14 @@ def _finding(found: Evaluation) -> str:
     return f"{found.best.label} takes {fewest}{bits:.3f} {interval}; {found.too_few}."
 
 
-def _check(skip: int, max_steps: int | None, seed: int, processes: int | None) -> None:
-    """Raise ValueError, naming the argument, unless these can be."""
-    for name, value, right, expected in (
-        ("skip", skip, skip >= 0, "at least 0 is"),
-        ("max_steps", max_steps, max_steps is None or max_steps >= 1, "at least 1 is"),
-        ("seed", seed, 0 <= seed < 2**50, "an integer from 0 to 2**50 - 1 is"),
-        ("processes", processes, processes is None or processes >= 1, "at least 1 is"),
-    ):
-        if not right:
-            raise ValueError(f"{name}: {expected} expected, not {value}")
-
-
-def _read(plans: Plans | str | Path, reading: Mapping[str, Any]) -> Plans:
-    """The plans, without an end symbol; `reading`: further arguments of `read_plans`."""
+def _read(plans: Plans | str | Path, reading: ReadOptions) -> Plans:
+    """The plans, without an end symbol."""
     if not isinstance(plans, Plans):
-        plans = read_plans(plans, **reading)
-    elif given := [name for name, value in reading.items() if not (value is None or value is False or value == "gap")]:
-        raise ValueError(f"{', '.join(given)}: for files only; plans have their own")
+        plans = reading.read(str(plans))
     return plans if plans.end is None else plans.without_end()
 
 
-def _with_actions(plans: Plans | str | Path, reading: Mapping[str, Any]) -> tuple[Plans, int]:
+def _with_actions(plans: Plans | str | Path, reading: ReadOptions) -> tuple[Plans, int]:
     """The plans that have actions, and how many have none: these are of no use to models."""
     read, file = _read(plans, reading), "plans" if isinstance(plans, Plans) else plans
     if read.num_actions > MOST_ACTIONS:
@@ -290,18 +243,15 @@ def _in_parts(plans: Plans) -> tuple[Plans, bool]:
     return in_parts(plans, min(BLOCKS, max(int(plans.mask().sum()) // 2, 1))), True
 
 
-def _folds(name: str, plans: Plans, folds: int | None) -> int:
+def _folds(name: str, plans: Plans, fits: FitOptions) -> int:
     """How many; by default no more than there are units."""
     groups = 0 if plans.group is None else len(plans.group.unique())
     units = groups if groups > 1 else len(plans)
     if units < 2:
         raise ValueError(f"{name}: at least two plans, or a single long one, are needed for cross-validation")
-    number = min(FOLDS, units) if folds is None else folds
-    check_count("folds", number, 0)
-    if number > units:
-        raise ValueError(f"folds: at most {units}, as many as there are groups or plans, are expected, not {number}")
-    if number < 2:  # which a `Design` takes for test plans
-        raise ValueError(f"folds: at least 2 are expected, not {number}")
+    number = min(FOLDS, units) if fits.folds is None else fits.folds
+    if not 2 <= number <= units:  # a `Design` takes 1 for test plans
+        raise ValueError(f"`folds` must be from 2 to {units}, the number of groups or plans, got {number}.")
     return number
 
 
@@ -310,12 +260,12 @@ def _contexts_from_0(plans: Plans, test: Plans | None) -> tuple[Plans, Plans | N
     contexts = [some.context for some in (plans, test) if some is not None and some.context is not None]
     named = plans.context_names is not None or (test is not None and test.context_names is not None)
     if contexts and contexts[0].is_floating_point() and not contexts[0].shape[-1]:
-        raise ValueError("context: it has no features; leave it out of the plans")
+        raise ValueError("`context` must have one feature at least, or be left out.")
     if not contexts or named or contexts[0].is_floating_point():
         return plans, test
     present = torch.cat([context.flatten().long() for context in contexts]).unique()
     if int(present[0]) < 0:
-        raise ValueError(f"context: numbers from 0 are expected, not {int(present[0])}")
+        raise ValueError(f"`context` must be numbers from 0, got {int(present[0])}.")
     new = [torch.searchsorted(present, context.long().contiguous()) for context in contexts]
     return replace(plans, context=new[0]), None if test is None else replace(test, context=new[-1])
 

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from neuroprior._files import written_whole
 from neuroprior._jobs import JobRun
-from neuroprior.behaviour.analysis.calibration import Reliability
-from neuroprior.behaviour.analysis.comparison import Score, score_bits, too_few, unit_name, units
+from neuroprior.behaviour.analysis.comparison import Score, action_bits, score_bits, too_few, unit_name
 from neuroprior.behaviour.report import fits
 from neuroprior.behaviour.report.fits import (
     ACTIONS,
@@ -54,8 +53,6 @@ class Model:
     how: str  # its settings in each fold, the distinct ones
     bits: Tensor  # [N, L]: those of each held-out action (and of the ends, where it predicts these too)
     score: Score  # their sums by independent unit
-    calibration: Reliability | None  # its forecasts against what happened; None where nothing was scored
-    generated: Tensor | None = None  # [g, L]: plans sampled in the place of held-out plans; None where it has none
 
     @property
     def label(self) -> str:
@@ -77,7 +74,7 @@ class Evaluation:
     mask: Tensor  # [N, L] bool: their actions that count
     models: Sequence[Model]  # in the order of the main table
     reference: tuple[Model, str]  # the model that the others are compared with, and its name in the report
-    sampled: Plans  # the plans in whose place plans were sampled
+    first_fold: Plans  # the plans that are held out in the first fold
     gains: pd.DataFrame  # the information by lag that models give
     settings: dict[str, Any]  # how it was made
 
@@ -95,13 +92,6 @@ class Evaluation:
     def best(self) -> Model:
         """The model that takes the fewest bits."""
         return min(self.models, key=lambda model: model.cost)
-
-    def leading(self, inputs: str) -> list[Model]:
-        """The models of figures, of those with this input: the best chain, and all that are no chains."""
-        same = [model for model in self.models if model.inputs == inputs]
-        chains = [model for model in same if model.name.removeprefix("markov-").isdecimal()]
-        chosen = [min(chains, key=lambda model: model.cost)] if chains else []
-        return chosen + [model for model in same if model not in chains and model.name != "uniform"]
 
     def table(self) -> pd.DataFrame:
         """A row a model: bits, nats and perplexity with intervals, and the paired difference from the reference."""
@@ -160,26 +150,16 @@ def evaluate(plans: Plans, test: Plans | None, design: Design, todo: Sequence[Jo
             # A chain may be too large for its tables in some folds.
             if all("how" in part for part in parts):
                 how = ", ".join(filter(None, dict.fromkeys(str(part["how"]) for part in parts)))
-                models.append(_model(name, inputs, how, parts, held_out, scored, mask))
+                bits = torch.zeros(scored.actions.shape)
+                for index, part in zip(held_out, parts, strict=True):
+                    bits[index] = torch.from_numpy(part["bits"])
+                models.append(Model(name, inputs, how, bits, score_bits(name, inputs, bits, scored, mask)))
     models.sort(key=lambda model: ([*WITH].index(model.inputs), ORDERED.index(model.name)))
     best = min(models, key=lambda model: model.cost)
     gains.sort(key=lambda row: (row["context"] == CONTEXT, row["model"] != COUNTED))
     table = pd.DataFrame(gains)
     reference = best, f"{best.name} ({best.inputs})"
     return Evaluation(plans, scored, mask, models, reference, scored[held_out[0]], table, asdict(design))
-
-
-def _model(
-    name: str, inputs: str, how: str, parts: Sequence[Arrays], held_out: Sequence[Tensor], scored: Plans, mask: Tensor
-) -> Model:
-    """A model from its results on each part of the plans, given by the numbers of the plans."""
-    bits = torch.zeros(scored.actions.shape)
-    for index, part in zip(held_out, parts, strict=True):
-        bits[index] = torch.from_numpy(part["bits"])
-    sums = [part["calibration"] for part in parts if "calibration" in part]
-    calibration = Reliability(torch.from_numpy(sum(sums[1:], start=sums[0]))) if sums else None
-    generated = torch.from_numpy(parts[0]["generated"]) if "generated" in parts[0] else None
-    return Model(name, inputs, how, bits, score_bits(name, inputs, bits, scored, mask), calibration, generated)
 
 
 def _gains(arrays: Arrays, inputs: str) -> list[dict[str, Any]]:
@@ -219,8 +199,8 @@ def evaluate_saved(priors: Mapping[str, Prior], plans: Plans, skip: int, is_tabl
         mask, inputs = counted(own, skip), CONTEXT if prior.takes_context else ACTIONS
         inputs = inputs if prior.past_durations is None else DURATIONS
         try:
-            arrays = fits.score_arrays(prior, own, mask, units(own, mask))
-            models.append(_model(name, inputs, type(prior).__name__, [arrays], [torch.arange(len(own))], own, mask))
+            bits = action_bits(prior, own)
+            models.append(Model(name, inputs, type(prior).__name__, bits, score_bits(name, inputs, bits, own, mask)))
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error
     plans, mask = replace(plans, notes=notes), counted(plans, skip)

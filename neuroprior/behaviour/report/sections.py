@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from math import log
 from typing import Any
 
 import pandas as pd
@@ -13,50 +12,29 @@ from neuroprior.behaviour.analysis.comparison import never_taken, too_few, unit_
 from neuroprior.behaviour.analysis.drift import action_drift, by_group, by_plan, by_position
 from neuroprior.behaviour.analysis.lags import mutual_information
 from neuroprior.behaviour.analysis.motifs import motifs
-from neuroprior.behaviour.analysis.orders import order_selection
 from neuroprior.behaviour.analysis.statistics import ENOUGH_UNITS
 from neuroprior.behaviour.analysis.transitions import transitions
-from neuroprior.behaviour.analysis.two_sample import two_sample_tests
 from neuroprior.behaviour.report import figures
 from neuroprior.behaviour.report.conditions import condition_section
 from neuroprior.behaviour.report.document import Column, table
 from neuroprior.behaviour.report.durations import duration_section
-from neuroprior.behaviour.report.fits import ACTIONS, CONTEXT
+from neuroprior.behaviour.report.fits import ACTIONS
 from neuroprior.behaviour.report.modes import mode_section
-from neuroprior.behaviour.report.page import FigureBox, Section, Table
+from neuroprior.behaviour.report.page import FigureBox, Section
 from neuroprior.behaviour.report.part import LISTED, SIGNIFICANT, Part, action_names, group_names, p_text
-from neuroprior.behaviour.report.scores import Evaluation, Model
+from neuroprior.behaviour.report.scores import Evaluation
 from neuroprior.plans import Plans, constant_context, has_patterns
 from neuroprior.plans.columns import never_occur
-from neuroprior.priors import learn_macros
 
-MOST_ORDER, MOST_LAG, MOST_MACROS = 6, 20, 16
+MOST_LAG = 20
 LISTED_LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 20)
-DRAWN = 12  # sequences, real and generated
-MANY_REPEATS = 0.2  # of all actions: beyond, over-represented sequences are also sought with repeats merged
 BEGINNING = 5  # actions of a plan that do not count in drift
 LEAST = 1e-9  # bits: below, a gain is 0 but for rounding
 
 
 def file_section(found: Evaluation) -> Part:
-    """What is in the file."""
-    frame = action_frame(found.plans)
-    tables, boxes = plans_tables(found.plans, frame), []
-    if len(frame):
-        caption = "Each row a plan, each colour an action" + (", by group" if found.plans.group is not None else "")
-        caption += (" and condition" if found.plans.condition is not None else "") + "."
-        alt = "The plans as rows of coloured strips over time."
-        boxes = [FigureBox(figures.ethogram_figure(found.plans), caption, alt, "ethogram")]
-    return Part(Section("Plans", tables=tables, figures=boxes), {"actions": frame})
-
-
-def plans_tables(plans: Plans, frame: pd.DataFrame) -> list[Table]:
-    """What was read: how many plans of which kind, with what readers noted of them, and the commonest of the actions.
-
-    Args:
-        plans: the plans.
-        frame: their `action_frame`.
-    """
+    """What was read: how many plans of which kind, the commonest of their actions, and the plans over time."""
+    plans, frame = found.plans, action_frame(found.plans)
     columns = {"plans": "plans:,", "actions": "actions:,", "shortest": "shortest", "longest": "longest"}
     columns |= {"kinds of\nactions": "kinds of actions", "groups": "groups", "context": "context"}
     columns |= {"conditions": "conditions"} if plans.condition is not None else {}
@@ -73,7 +51,13 @@ def plans_tables(plans: Plans, frame: pd.DataFrame) -> list[Table]:
     caption = f"The {LISTED} commonest of {len(frame)}." if len(frame) > LISTED else ""
     never = never_occur(plans.actions[plans.mask()].unique().cpu().numpy(), plans.num_actions, plans.action_names)
     caption = f"{caption} {never[:1].upper()}{never[1:]}.".strip() if never else caption
-    return [described, table(frame[:LISTED], counted, caption, "Actions")]
+    tables, boxes = [described, table(frame[:LISTED], counted, caption, "Actions")], []
+    if len(frame):
+        caption = "Each row a plan, each colour an action" + (", by group" if plans.group is not None else "")
+        caption += (" and condition" if plans.condition is not None else "") + "."
+        alt = "The plans as rows of coloured strips over time."
+        boxes = [FigureBox(figures.ethogram_figure(plans), caption, alt, "ethogram")]
+    return Part(Section("Plans", tables=tables, figures=boxes), {"actions": frame})
 
 
 def action_frame(plans: Plans) -> pd.DataFrame:
@@ -173,7 +157,9 @@ def lag_section(found: Evaluation) -> Part | None:
     wide = lags.assign(cell=cells, curve=names).pivot(index="lag", columns="curve", values="cell")[names.unique()]
     wide = wide[wide.index.isin(LISTED_LAGS)].reset_index()
     columns = {name.replace(", ", "\n").replace("with context", "+ context"): name for name in wide.columns}
-    over = f"{unit_name(found.plans)} (gain: {unit_name(found.sampled)} of the first fold, if there are {ENOUGH_UNITS})"
+    over = (
+        f"{unit_name(found.plans)} (gain: {unit_name(found.first_fold)} of the first fold, if there are {ENOUGH_UNITS})"
+    )
     text = [
         "Mutual information: of two actions k steps apart, whatever lies between. Gain: how much the action k steps"
         " back improves predictions beyond all nearer ones, in held-out plans of the first fold: a model that knows k"
@@ -192,71 +178,13 @@ def lag_section(found: Evaluation) -> Part | None:
     return Part(Section("Information by lag", text, [shown], [box]), {"lags": lags})
 
 
-def order_section(found: Evaluation) -> Part | None:
-    """Which order a Markov chain needs."""
-    plans = found.plans
-    lengths = plans.mask().sum(1)
-    if int(lengths.max()) < 2 or plans.num_actions < 2:
-        return None
-    # All orders are fitted on the same actions: those with as many before them as the highest order takes.
-    most = min(MOST_ORDER, max(int(lengths.double().median()) // 2, 1), int(lengths.max()) - 1)
-    number = _num_contexts(plans)
-    fitted = {ACTIONS: order_selection(plans, most)}
-    if number is not None:
-        fitted[CONTEXT] = order_selection(plans, most, number)
-    orders = pd.concat([pd.DataFrame(own).assign(context=inputs) for inputs, own in fitted.items()], ignore_index=True)
-    orders = orders[["context", *orders.columns.drop("context")]]
-    scale = 2 * log(2) * orders["num_actions_scored"].clip(lower=1)
-    orders = orders.assign(bic_bits=orders["bic"] / scale, aic_bits=orders["aic"] / scale)
-    scores = found.table()
-    held_out = figures.chain_scores(scores)[["order", "context", "bits_per_action"]]
-    both = orders.merge(held_out, how="left", on=["order", "context"])
-    criteria = {"BIC": "bic_bits", "AIC": "aic_bits", "held out": "bits_per_action"}
-    columns: dict[str, Column] = {"order": "order", "input": _input, "parameters": "num_parameters:,"}
-    for heading, name in criteria.items():
-        least = (both[name] == both.groupby("context")[name].transform("min")) & (not found.too_few)
-        marked = both[name].map("{:.4f}".format) + least.map({True: "*", False: " "})
-        both[heading] = marked.where(both[name].notna())
-        columns[heading] = heading
-    star = "" if found.too_few else ", the least of each input with a star"
-    caption = f"Bits per action{star}; the information criteria are halved, so that they stand on the same scale."
-    text = [
-        "The information criteria judge plans that were learned from, and count a parameter for each action after each"
-        " history that occurred. Held-out chains back off to shorter histories where a history is rare."
-    ]
-    text += [_no_verdict(found.too_few)] if found.too_few else []
-    shown = table(both, columns, caption, align="llrrrr")
-    figure = figures.order_figure(orders, scores, not found.too_few)
-    caption = "" if found.too_few else "The least of each curve is ringed."
-    box = FigureBox(figure, caption or "Bits per action by order.", "Order selection.", "orders")
-    return Part(Section("Markov order", text, [shown], [box]), {"orders": orders})
-
-
-def calibration_section(found: Evaluation) -> Part | None:
-    """Whether forecast probabilities are the shares of actions taken."""
-    models = found.leading(found.best.inputs) or found.models
-    known = [(model, model.calibration) for model in models if model.calibration is not None]
-    rows = [(own.name, own.inputs, one.forecast, *one.taken, one.number) for own, sums in known for one in sums.bins]
-    if not rows:
-        return None
-    names = ["model", "context", "forecast", "taken", "low", "high", "number"]
-    calibration = pd.DataFrame(rows, columns=names)
-    errors = [{"model": own.label, "error": 100 * sums.expected_calibration_error} for own, sums in known]
-    columns = {"model": "model", "expected calibration error, %": "error:.2f"}
-    shown = table(pd.DataFrame(errors), columns, "Mean distance of forecast probability and share taken.")
-    text = ["Of the actions with a forecast probability of about 0.3, were 0.3 taken? Points on the diagonal: yes."]
-    caption = f"Forecast probability against the share taken; 95 % intervals over {found.unit}."
-    box = FigureBox(figures.calibration_figure(calibration), caption, "Calibration of the models.", "calibration")
-    return Part(Section("Calibration", text, [shown], [box]), {"calibration": calibration})
-
-
 def transition_section(found: Evaluation) -> Part | None:
     """Transition probabilities, overall and in each group."""
     plans = found.plans
     if int(plans.mask().sum(1).max()) < 2:
         return None
     result = transitions(plans, generator=_shuffles())
-    names, tested = action_names(plans), result.test == "permutation"
+    names = action_names(plans)
     groups = group_names(plans, result.groups) if plans.group is not None else []
     probs, each = result.probs(), result.group_probs()
     of_groups = zip(groups, result.group_counts, each, result.cell_p_values, strict=False)
@@ -267,7 +195,7 @@ def transition_section(found: Evaluation) -> Part | None:
             "to": names[b],
             "count": int(counts[a, b]),
             "probability": float(matrix[a, b]),
-            "p_value": float(p_values[a, b]) if tested and p_values is not None else None,
+            "p_value": None if p_values is None else float(p_values[a, b]),
         }
         for group, counts, matrix, p_values in [("all", result.counts, probs, None), *of_groups]
         for a, b in counts.nonzero().tolist()
@@ -278,7 +206,7 @@ def transition_section(found: Evaluation) -> Part | None:
     boxes = [FigureBox(figures.transition_figure(probs, names), caption, "Transition matrix.", "transitions")]
     if len(groups) > 1:
         row = {"groups": len(groups), "test": result.test, "permutations": result.permutations}
-        test = pd.DataFrame([row | {"statistic": result.statistic, "p_value": result.p_value if tested else None}])
+        test = pd.DataFrame([row | {"statistic": result.statistic, "p_value": result.p_value}])
         few = too_few(plans)
         tested_by = "That groups have the same transitions is tested by permuting plans between them, where they have"
         text.append(_no_verdict(few) or f"{tested_by} enough. Marked cells differ at p < 0.05, corrected for all.")
@@ -286,7 +214,7 @@ def transition_section(found: Evaluation) -> Part | None:
         if not few:
             caption = "Whether groups have the same transitions (p: blank if not tested)."
             tables.append(table(test, columns, caption, align="rrr"))
-        significant = (result.cell_p_values < SIGNIFICANT) & tested & (not few)
+        significant = (result.cell_p_values < SIGNIFICANT) & (not few)
         figure = figures.group_transition_figure(each, probs, names, groups, significant)
         caption = "Each group's transition probabilities less those of all."
         boxes.append(FigureBox(figure, caption, "Differences of the groups' transitions.", "group_transitions"))
@@ -297,15 +225,12 @@ def transition_section(found: Evaluation) -> Part | None:
 def motif_section(found: Evaluation) -> Part | None:
     """Over-represented sequences."""
     plans, names = found.plans, action_names(found.plans)
-    again = (plans.actions[:, 1:] == plans.actions[:, :-1])[plans.mask()[:, 1:]].double().mean()
-    rows = [
-        {"repeats": "merged" if merged else "kept", "sequence": " ".join(names[action] for action in one.actions)}
+    frame = pd.DataFrame(
+        {"sequence": " ".join(names[action] for action in one.actions)}
         | {key: value for key, value in asdict(one).items() if key != "actions"}
-        for merged in ((False, True) if float(again) > MANY_REPEATS else (False,))
-        for one in motifs(plans, top=LISTED, collapse_repeats=merged)
+        for one in motifs(plans, top=LISTED)
         if one.corrected < SIGNIFICANT
-    ]
-    frame = pd.DataFrame(rows)
+    )
     columns: Mapping[str, Column] = {
         "sequence": "sequence",
         "count": "count:,",
@@ -315,127 +240,22 @@ def motif_section(found: Evaluation) -> Part | None:
         "p": lambda row: p_text(row.corrected),
     }
     few = too_few(plans)
-    tables, boxes = [], []
-    for repeats, own in frame.groupby("repeats", sort=False) if rows else []:
-        merged = ", repeats of an action merged" * (repeats == "merged")
-        p = "Listed by" if few else "p:"
-        caption = f"Against a chain of order n - 2{merged}. {p} Fisher's exact test, corrected for all (Holm)."
-        tables.append(table(own, _without_p(columns, few), caption))
-        alt = "Over-represented sequences: " + "; ".join(own["sequence"][:5])
-        figure = figures.motif_figure(own)
-        boxes.append(
-            FigureBox(figure, f"Times as often as expected{merged}.", alt, "motifs" + "_merged" * bool(merged))
-        )
     text = [
         "Sequences of three to six actions that occur more (or less) often than their parts predict: than under a chain"
         " fitted to how often the sequence without its first, and without its last action occurs. All plans are taken"
         " to be of one chain: where groups differ, sequences of some of them are over-represented, too. One such"
         " sequence makes others over-represented that share its beginning.",
-        *([] if rows else ["There are none (p < 0.05, corrected for all sequences)."]),
+        *([] if len(frame) else ["There are none (p < 0.05, corrected for all sequences)."]),
         *([_no_verdict(few)] if few else []),
     ]
+    tables, boxes = [], []
+    if len(frame):
+        p = "Listed by" if few else "p:"
+        caption = f"Against a chain of order n - 2. {p} Fisher's exact test, corrected for all (Holm)."
+        tables = [table(frame, _without_p(columns, few), caption)]
+        alt = "Over-represented sequences: " + "; ".join(frame["sequence"][:5])
+        boxes = [FigureBox(figures.motif_figure(frame), "Times as often as expected.", alt, "motifs")]
     return Part(Section("Over-represented sequences", text, tables, boxes), {"motifs": frame})
-
-
-def macro_section(found: Evaluation) -> Part | None:
-    """Sequences that could be taken as one action; None where none makes the code of the plans shorter."""
-    plans, names = found.plans, action_names(found.plans)
-    macros, _ = learn_macros(plans, MOST_MACROS, "compression")
-    if not macros:
-        return None
-    spelled = [" ".join(names[action] for action in macro.actions) for macro in macros]
-    counts = plans.actions[plans.mask()].long().bincount().double()
-    before = float(-torch.special.xlogy(counts, counts / counts.sum()).sum()) / log(2)
-    rows = [(name, len(one.actions), one.count, one.gain) for name, one in zip(spelled, macros, strict=True)]
-    frame = pd.DataFrame(rows, columns=["macro", "actions", "count", "gain_bits"])
-    frame["bits_per_action"] = (before - frame["gain_bits"].cumsum()) / float(counts.sum())
-    text = [
-        "Sequences that could be taken as one action. Repeatedly, the two successive actions (or macro-actions) are"
-        " joined that shorten the code of the plans most, in which each is coded by its frequency, and which includes"
-        " what macro-actions stand for. Earlier ones may be parts of later ones."
-    ]
-    none = pd.DataFrame([{"macro": "none", "bits_per_action": before / float(counts.sum())}])
-    shown = pd.concat([none, frame]).astype({"count": "Int64"})
-    columns = {"macro-action": "macro", "count": "count:,", "gain": "gain_bits:,.0f"}
-    columns |= {"bits per action": "bits_per_action:.3f"}
-    caption = (
-        "In the order in which they were found. count: how often each was put in then; gain: bits saved then; bits per"
-        " action: of the code with all macro-actions up to that one."
-    )
-    return Part(Section("Macro-actions", text, [table(shown, columns, caption)]), {"macros": frame})
-
-
-def likeness_section(found: Evaluation) -> Part | None:
-    """Sequences sampled from the models beside real ones."""
-    # Where plans come in groups there is no test: plans of one subject are more alike than those of a model of all
-    # subjects, however good, and the first fold holds too few groups to shuffle these.
-    cut = bool(found.settings.get("cut"))
-    few = too_few(found.sampled, cut=cut)
-    tested = found.scored.group is None and not few
-    rows: list[dict[str, Any]] = []
-    shown: tuple[Model, Plans, list[Any]] | None = None
-    for model in sorted(found.leading(CONTEXT) + found.leading(ACTIONS), key=lambda model: model.cost):
-        if model.generated is None:
-            continue
-        real = found.sampled[: len(model.generated)]
-        real = Plans(real.actions, real.num_actions, real.lengths)
-        results = two_sample_tests(real, Plans(model.generated, real.num_actions, real.lengths), generator=_shuffles())
-        if results and shown is None:
-            shown = model, real, results
-        rows += [
-            {"model": model.name, "context": model.inputs, "statistic": one.statistic}
-            | {"distance": one.distance, "null_distance": one.null_distance}
-            | {"p_value": one.p_value if tested else None, "corrected": one.corrected if tested else None}
-            for one in results
-        ]
-    if shown is None:
-        return None
-    best, real, results = shown
-    frame = pd.DataFrame(rows)
-    stars = (frame["corrected"] < SIGNIFICANT).map({True: "*", False: ""})
-    cells = frame.assign(cell=frame["distance"].map("{:.3f}".format) + stars)
-    statistics = [one.statistic for one in results]
-    order = frame[["model", "context"]].drop_duplicates()
-    wide = cells.pivot(index=["model", "context"], columns="statistic", values="cell").reset_index()
-    wide = order.merge(wide, on=["model", "context"])
-    wide.loc[len(wide)] = {"model": "same source", "context": ""} | {
-        one.statistic: f"{one.null_distance:.3f}" for one in results
-    }
-    test = "*: p < 0.05, permutation test over plans, corrected."
-    if not tested:
-        grouped = found.scored.group is not None
-        test = "Not tested: plans of one group are not independent." if grouped else f"Not tested: {few}."
-    caption = (
-        f"Total variation between the distributions in generated and in held-out real plans (0: the same). {test}"
-        " same source: the distance of two such sets from one source, were all plans independent."
-    )
-    columns: dict[str, Column] = {
-        "model": "model",
-        "input": _input,
-        **{name.replace(" ", "\n"): name for name in statistics},
-    }
-    text = [
-        "From each model of the first fold a plan was sampled for each held-out plan, as long as that. Generated and"
-        " real plans are compared by sequences of actions (n-grams), by how long an action is repeated, and by how"
-        " long it takes to return. The figures show the model with the fewest bits."
-    ]
-    assert best.generated is not None
-    beyond = ~real[:DRAWN].mask()
-    above, below = (some[:DRAWN].long().masked_fill(beyond, -1) for some in (real.actions, best.generated))
-    caption_of_figure = f"Held-out plans, and plans sampled from {best.label}."
-    figure = figures.raster_figure(above, below, action_names(found.plans))
-    boxes = [FigureBox(figure, caption_of_figure, "Real and generated sequences as strips of colour.", "raster")]
-    lengths = {
-        f"{one.statistic}, actions": (one.real.tolist(), one.generated.tolist())
-        for one in results
-        if len(one.classes[0]) == 1 and "gram" not in one.statistic
-    }
-    if lengths:
-        caption_of_figure = "Shares of run lengths and return times; the last class holds all that are longer."
-        alt = "Run lengths and return times, real and generated."
-        boxes.append(FigureBox(figures.distribution_figure(lengths), caption_of_figure, alt, "distributions"))
-    shown_table = table(wide, columns, caption, align="ll" + "r" * len(statistics))
-    return Part(Section("Generated sequences", text, [shown_table], boxes), {"likeness": frame})
 
 
 def drift_section(found: Evaluation) -> Part | None:
@@ -455,9 +275,7 @@ def drift_section(found: Evaluation) -> Part | None:
     drift = pd.DataFrame(rows, columns=["what", "name", "bits", "low", "high"])
     own = pd.DataFrame({"group": plans.group.tolist(), "bits": plans.bits.tolist()})
     own = own.assign(index=own.groupby("group").cumcount() + 1)
-    tests: list[dict[str, Any]] = []
-    if within.trend is not None:
-        tests.append({"test": "change over a plan, bits"} | within.trend._asdict())
+    tests: list[dict[str, Any]] = [{"test": "change over a plan, bits"} | within.trend._asdict()]
     if plans.trend is not None:
         tests.append({"test": f"rank correlation from {plans.item[:-1]} to {plans.item[:-1]}"} | plans.trend._asdict())
     if groups.p_value is not None:
@@ -474,19 +292,14 @@ def drift_section(found: Evaluation) -> Part | None:
         *(["The only plan was cut into consecutive parts, which stand for plans."] * bool(found.settings.get("cut"))),
         *([_no_verdict(found.too_few)] if found.too_few else []),
     ]
-    tables = []
-    if tests:
-        columns: Mapping[str, Column] = {
-            "test": "test",
-            "estimate": "mean:+.3f",
-            "95 % interval": lambda row: "" if pd.isna(row["mean"]) else f"{row.low:+.3f} to {row.high:+.3f}",
-            "p": "p_value:.2g",
-        }
-        tables.append(
-            table(
-                tests_frame, _without_p(columns, found.too_few), f"Bits of {model.label}; intervals over {found.unit}."
-            )
-        )
+    columns: Mapping[str, Column] = {
+        "test": "test",
+        "estimate": "mean:+.3f",
+        "95 % interval": lambda row: "" if pd.isna(row["mean"]) else f"{row.low:+.3f} to {row.high:+.3f}",
+        "p": "p_value:.2g",
+    }
+    caption = f"Bits of {model.label}; intervals over {found.unit}."
+    tables = [table(tests_frame, _without_p(columns, found.too_few), caption)]
     caption = f"Bits per action of {model.label}. 95 % intervals over {found.unit}; of groups, over the plans of each."
     box = FigureBox(figures.drift_figure(drift, own), caption, "Bits per action by place, plan and group.", "drift")
     actions = _action_drift(found.plans)
@@ -535,14 +348,10 @@ SECTIONS: dict[str, Callable[[Evaluation], Part | None]] = {
     "scores": score_section,
     "conditions": condition_section,
     "lags": lag_section,
-    "orders": order_section,
-    "calibration": calibration_section,
     "transitions": transition_section,
     "motifs": motif_section,
-    "macros": macro_section,
     "durations": duration_section,
     "modes": mode_section,
-    "likeness": likeness_section,
     "drift": drift_section,
 }
 """By name, in the order of the page."""

@@ -28,11 +28,11 @@ from tests.support.sources import FALSE_ALARM, refuses, seeded
 
 
 @settings(max_examples=50, deadline=None, derandomize=True)
-@given(st.lists(st.floats(-100, 100), min_size=2, max_size=9), st.floats(0.1, 50), st.sampled_from([0.5, 0.95, 0.99]))
-def test_a_ratio_over_equal_sizes_is_a_mean(totals, size, level):
+@given(st.lists(st.floats(-100, 100), min_size=2, max_size=9), st.floats(0.1, 50))
+def test_a_ratio_over_equal_sizes_is_a_mean(totals, size):
     values = np.array(totals) / size
-    found = ratio_difference(totals, [size] * len(totals), level)
-    assert found[:3] == pytest.approx(tuple(mean_interval(values, level)), rel=1e-6, abs=1e-9)
+    found = ratio_difference(totals, [size] * len(totals))
+    assert found[:3] == pytest.approx(tuple(mean_interval(values)), rel=1e-6, abs=1e-9)
     if np.ptp(values) > 1e-6:
         assert found.p_value == pytest.approx(float(stats.ttest_1samp(values, 0).pvalue), rel=1e-6, abs=1e-12)
 
@@ -44,7 +44,6 @@ def test_a_ratio_by_hand():
     assert found[:3] == pytest.approx((2, 2 - t * error, 2 + t * error), abs=1e-6)
     # With 2 degrees of freedom P(|T| > t) = 1 - t / sqrt(2 + t**2).
     assert found.p_value == pytest.approx(1 - (2 / error) / math.sqrt(2 + (2 / error) ** 2))
-    assert ratio_difference([2, 3, 7], [1, 2, 3], level=0.9).low == pytest.approx(2 - 2.919986 * error, abs=1e-6)
 
 
 def test_a_ratio_without_spread():
@@ -67,7 +66,7 @@ def test_a_ratio_of_differences_is_paired_and_antisymmetric():
     [
         ([1], [1], "totals"),
         ([1, 2], [1], "sizes"),
-        ([1, 2], [1, 2, 3], "sizes: 2 are expected"),
+        ([1, 2], [1, 2, 3], "`sizes` must have 2 values"),
         ([1, 2], [0, 0], "sizes"),
         ([1, 2], [-1, 2], "sizes"),
         ([[1, 2]], [1, 2], "totals"),
@@ -94,20 +93,6 @@ def test_intervals_of_ratios_cover_at_their_level():
         hits += found.low <= 2 <= found.high
     low = stats.binom.ppf(FALSE_ALARM / 2, 2000, 0.925)
     assert low <= hits <= stats.binom.isf(FALSE_ALARM / 2, 2000, 0.965)
-
-
-def test_scores_cover_at_their_level():
-    """400 samples of plans of 1 to 8 independent actions, whose bits are a cross entropy: as above."""
-    prior = MarkovPrior(2, 0, backoff="dirichlet").fit(torch.tensor([[0, 0, 0, 1]]))
-    p = prior(torch.zeros(1, 1).long()).softmax(-1)[0, 0].double()
-    truth = float(-(0.6 * p[0].log2() + 0.4 * p[1].log2()))
-    generator, hits = seeded(1), 0
-    for _ in range(400):
-        actions = (torch.rand(60, 8, generator=generator) < 0.4).long()
-        found = score("m", prior, Plans(actions, 2, torch.randint(1, 9, (60,), generator=generator))).bits_per_action()
-        hits += found.low <= truth <= found.high
-    low = stats.binom.ppf(FALSE_ALARM / 2, 400, 0.925)
-    assert low <= hits <= stats.binom.isf(FALSE_ALARM / 2, 400, 0.965)
 
 
 def held_out(**more) -> Plans:
@@ -182,15 +167,10 @@ def test_a_single_plan_is_cut_in_parts(length, group):
     torch.testing.assert_close(score("it", prior, plans).bits, want)
 
 
-@pytest.mark.parametrize("lengths", [[0, 0], [1, 0]])
+@pytest.mark.parametrize("lengths", [[], [0, 0], [1, 0]])
 def test_fewer_than_two_actions_are_refused(lengths):
     with refuses("two held-out actions"):
-        score("it", UniformPrior(3), Plans(torch.zeros(2, 4).long(), 3, torch.tensor(lengths)))
-
-
-def test_no_plans_are_refused():
-    with refuses("two held-out actions"):
-        score("it", UniformPrior(3), Plans(torch.zeros(0, 4).long(), 3))
+        score("it", UniformPrior(3), Plans(torch.zeros(len(lengths), 4).long(), 3, torch.tensor(lengths).long()))
 
 
 @pytest.mark.parametrize("group", [None, torch.arange(12) // 3 * 5])
@@ -215,10 +195,10 @@ def test_score_of_bits_with_a_mask(group):
     torch.testing.assert_close(again.bits, score("it", prior, plans).bits)
     mask[:, :] = False
     mask[0, 3] = True
-    with refuses("two held-out actions", "not 1"):
+    with refuses("two held-out actions", "got 1"):
         score_bits("it", "actions", surprisal, plans, mask)
     for wrong in (~plans.mask(), plans.mask().long(), plans.mask()[:1]):
-        with refuses("mask: bool", "behind the end of a plan"):
+        with refuses("`mask` must be bool", "behind the end of a plan"):
             score_bits("it", "actions", surprisal, plans, wrong)
 
 
@@ -232,7 +212,7 @@ def test_minus_is_paired():
     others = replace(plans, actions=(plans.actions + 1) % 3)  # of equal lengths
     for other in (held_out()[:9], held_out(group=torch.arange(12) // 4), held_out().with_end(), others):
         one = score("other", UniformPrior(other.num_actions), other)
-        with refuses("MarkovPrior, UniformPrior", "scores on the same plans"):
+        with refuses("MarkovPrior and UniformPrior must be scored on the same plans"):
             markov.minus(replace(one, model="UniformPrior"))
 
 
@@ -286,17 +266,6 @@ def test_each_baseline_is_the_best_of_what_was_tried(num_contexts):
     assert found[-1].validation_bits == pytest.approx(min(bits(t, validation) for t in trees), abs=1e-6)
     assert isinstance(tree, ContextTreePrior)
     assert found[-1].how == f"depth {DEPTH}"
-
-
-@pytest.mark.parametrize("matters", [True, False])
-def test_context_is_taken_where_it_helps(matters):
-    training, validation = sources(matters), sources(matters, 200, seed=7)
-    if not matters:  # many contexts, so that what is lost by counting them apart is not random
-        training, validation = (replace(p, context=torch.arange(len(p)) % 20) for p in (training, validation))
-    for baseline in baselines(training, validation, 20):
-        if baseline.model in ("markov-1", "markov-2", "context tree"):
-            inputs = score(baseline.model, baseline.prior, validation).inputs
-            assert ("context" in inputs) == matters, baseline.model
 
 
 def test_contexts_that_only_held_out_plans_have():

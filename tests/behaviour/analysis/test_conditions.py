@@ -168,11 +168,6 @@ def test_the_prediction_is_that_of_chains_refitted_without_the_unit(conditions):
     correct = logs[:, 1:].argmax(1) == labels
     assert {*correct} == {False, True}
     assert found.accuracy == pytest.approx(np.mean([correct[np.array(labels) == k].mean() for k in range(num)]))
-    # What each transition carries adds up to the log odds of the right conditions.
-    assert float(found.carried.sum()) == pytest.approx(odds[range(len(blocks)), labels].sum() / actions)
-    assert {tuple(pair) for pair in found.sequences.tolist()} == {
-        (a if a < 3 else -1, b) for _, _, a, b in pairs_of(plans)
-    }
 
 
 def test_the_p_values_of_bits_and_classifier_are_those_of_relabelled_plans():
@@ -280,18 +275,12 @@ def test_features_are_shares_and_mean_log_durations_by_hand():
     assert numbers["durations", 1] == pytest.approx(log(9) / 3)
 
 
-def test_four_against_four():
-    found = compare_conditions(study(0, between(8)))
-    assert found.smallest_p == pytest.approx(2 / 70)
-    assert found.labellings == 70
-    assert found.conclusive
-    assert "With 4 against 4 groups the smallest possible p is 0.029" in found.verdict
-
-
 @pytest.mark.parametrize(("permutations", "labellings", "smallest"), [(69, 70, 2 / 70), (68, 69, 1 / 69)])
 def test_all_labellings_are_compared_where_they_are_no_more(permutations, labellings, smallest):
     found = compare_conditions(study(0, between(8)), permutations, seeded(0))
     assert (found.labellings, found.exact, found.smallest_p) == (labellings, labellings == 70, pytest.approx(smallest))
+    assert found.conclusive
+    assert f"With 4 against 4 groups the smallest possible p is {smallest:.2g}" in found.verdict
 
 
 def test_four_against_four_can_show_that_behaviour_differs_but_not_in_what():
@@ -395,11 +384,12 @@ def test_random_permutations_give_the_exact_p_value():
     assert again.p_value == drawn.p_value
 
 
-def test_work_is_bounded():
+def test_work_is_bounded(monkeypatch):
     plans = study(8, between(14, 1), length=20, num_actions=3)
 
     def drawn(max_work):
-        return compare_conditions(plans, generator=seeded(0), max_work=max_work).labellings - 1
+        monkeypatch.setattr("neuroprior.behaviour.analysis.conditions.MAX_WORK", max_work)
+        return compare_conditions(plans, generator=seeded(0)).labellings - 1
 
     assert drawn(1) == drawn(300_000) == 999
     assert 999 < drawn(10**6) < 3431
@@ -561,12 +551,6 @@ def test_a_planted_change_is_found_and_nothing_else(conditions):
     assert found.prediction.gain.low > 0
     assert found.prediction.accuracy > 0.9
     assert "Behaviour differs between drug 0 and drug 1" in found.verdict
-    # The same two transitions carry the classifier.
-    carried = found.prediction.carried.argsort(descending=True)[:2]
-    speaks = zip(
-        map(tuple, found.prediction.sequences[carried].tolist()), found.prediction.speaks_for[carried], strict=True
-    )
-    assert {sequence: int(label) for sequence, label in speaks} == {(0, 1): 0, (0, 2): 1}
 
 
 def false_alarms(conditions, studies: int, **settings) -> Counter[str]:

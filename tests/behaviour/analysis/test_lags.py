@@ -7,11 +7,10 @@ import pytest
 import torch
 from scipy import stats
 
-from neuroprior import MarkovPrior, Plans, UniformPrior
-from neuroprior.behaviour.analysis.comparison import score
-from neuroprior.behaviour.analysis.lags import bits_by_position, mutual_information, pieces
+from neuroprior import Plans
+from neuroprior.behaviour.analysis.lags import mutual_information, pieces
 from neuroprior.plans.folds import BLOCKS
-from tests.support.sources import FALSE_ALARM, TablePrior, distribution, every_plan, refuses, seeded
+from tests.support.sources import FALSE_ALARM, refuses, seeded
 
 
 def two_state(num: int, length: int, stay: float, generator: torch.Generator) -> Plans:
@@ -222,40 +221,6 @@ def test_pieces_bad_input():
     for length, most in ((0, 1), (1, 0)):
         with refuses("most" if length else "length"):
             pieces(numbered(), length, most)
-
-
-def test_bits_by_position():
-    """Against the enumeration of all plans of a written-down prior, in equal numbers as their probabilities."""
-    prior = TablePrior.random(2, 3, seed=4)
-    plans, probs = every_plan(2, 3), distribution(prior, 3)
-    found = bits_by_position(prior, Plans(plans, 2))
-    log_probs = prior.action_log_probs(Plans(plans, 2)).double() / math.log(2)
-    assert [one.bits.tolist() for one in found] == [pytest.approx((-column).tolist()) for column in log_probs.T]
-    # The chain rule: weighted by their probabilities the positions' entropies sum to that of the plans.
-    total = sum(float((one.bits * probs).sum()) for one in found)
-    assert total == pytest.approx(float(-(probs * probs.log2()).sum()), rel=1e-5)
-    grouped = bits_by_position(prior, Plans(plans, 2, group=torch.arange(8) % 3))
-    assert [one.actions.tolist() for one in grouped] == [[3, 3, 2]] * 3
-    assert grouped[1].bits[2] == pytest.approx(float(found[1].bits[[2, 5]].sum()))
-    whole = score("it", prior, Plans(plans, 2, group=torch.arange(8) % 3))
-    torch.testing.assert_close(sum(one.bits for one in grouped), whole.bits)
-
-
-def test_pieces_show_how_far_a_chain_looks_back():
-    """A chain of order 1: the first action back gives 1 - H(0.9), those before it nothing."""
-    training, held_out = (pieces(two_state(40, 500, 0.9, seeded(s)), 4, 20_000, seeded(9)) for s in (10, 11))
-    found = bits_by_position(MarkovPrior(2, 3).fit(training), held_out)
-    assert [one.model for one in found] == [f"MarkovPrior after {j}" for j in range(4)]
-    gains = [found[j - 1].minus(found[j]) for j in (1, 2, 3)]
-    assert gains[0].low <= known(0.9, 1) <= gains[0].high
-    assert gains[0].mean > 0.4
-    assert max(abs(gain.mean) for gain in gains[1:]) < 0.01
-
-
-def test_bits_by_position_refuses():
-    for wrong in (numbered(), numbered()[:1], Plans(torch.zeros(3, 0).long(), 50)):
-        with refuses("same length"):
-            bits_by_position(UniformPrior(50), wrong)
 
 
 def test_of_few_pairs_that_depend_the_information_is_above_what_shuffled_ones_give():

@@ -9,15 +9,12 @@ import torch
 
 from neuroprior import Plans
 from neuroprior.behaviour import (
-    ModeChoice,
     choose_modes,
-    match_modes,
     mode_frame,
     mode_plans,
     mode_table,
-    mode_transitions,
 )
-from neuroprior.behaviour.analysis.modes import agreements
+from neuroprior.behaviour.analysis.modes import agreements, mode_transitions
 from neuroprior.priors import SwitchingPrior
 from tests.support.sources import refuses, seeded
 
@@ -91,7 +88,6 @@ def test_modes_are_matched_whatever_their_order():
     plans, _ = source(10, 40, seed=1, modes=3)
     smoothed = SwitchingPrior(4, 3, 0).fit(plans, generator=seeded(0)).posterior(plans).smoothed
     order = torch.tensor([2, 0, 1])
-    assert match_modes(smoothed, smoothed[..., order], plans.mask()).tolist() == order.argsort().tolist()
     torch.testing.assert_close(
         agreements(smoothed, smoothed[..., order], plans.mask()), torch.ones(3, dtype=torch.double)
     )
@@ -164,20 +160,20 @@ def test_the_table_says_what_each_mode_does():
     assert table.loc["walk", "enters"] == "hill 1.00"
 
 
-def test_wrong_arguments_are_named():
-    plans, _ = source(6, 10, seed=1)
-    with refuses("num_modes"):
-        choose_modes(plans, [])
-    with refuses("num_modes"):
-        choose_modes(plans, [0, 1])
-    with refuses("folds"):
-        choose_modes(plans, [1], number_of_folds=7)
-    with refuses("order"):
-        choose_modes(plans, [1], order=-1)
-    for mask in (torch.ones(2, dtype=torch.bool), torch.ones_like(plans.actions)):
-        with pytest.raises(ValueError, match=r"mask: bool \[\d+, \d+\], as the actions, is expected"):
-            choose_modes(plans, [1], mask=mask)
-    assert isinstance(choose_modes(plans, [1], number_of_folds=2, generator=seeded(0)), ModeChoice)
+@pytest.mark.parametrize(
+    ("numbers", "options", "words"),
+    [
+        ([], {}, "`num_modes` must not be empty"),
+        ([0, 1], {}, "num_modes"),
+        ([1], {"number_of_folds": 7}, "folds"),
+        ([1], {"order": -1}, "order"),
+        ([1], {"mask": torch.ones(2, dtype=torch.bool)}, "`mask` must be bool of shape [6, 10]"),
+        ([1], {"mask": torch.ones(6, 10, dtype=torch.long)}, "`mask` must be bool of shape [6, 10]"),
+    ],
+)
+def test_wrong_arguments_are_named(numbers, options, words):
+    with refuses(words):
+        choose_modes(source(6, 10, seed=1)[0], numbers, **options)
 
 
 def test_transitions_of_modes_are_expected_counts():

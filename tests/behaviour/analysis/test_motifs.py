@@ -6,7 +6,6 @@ import sys
 from collections import Counter
 from dataclasses import astuple
 
-import numpy as np
 import pytest
 import torch
 from scipy import stats
@@ -26,7 +25,7 @@ def fisher(count: int, total: int, successes: int, draws: int) -> float:
     return min(2 * float(stats.fisher_exact(table, side).pvalue), 1)
 
 
-def test_tails_are_those_of_scipy():
+def test_tails_are_those_of_fishers_test():
     """All 2 x 2 tables of up to 12 in all."""
     tables = [
         (x, total, s, d)
@@ -36,16 +35,6 @@ def test_tails_are_those_of_scipy():
     ]
     found = fisher_two_sided(*torch.tensor(tables).T)
     assert found.tolist() == pytest.approx([fisher(*table) for table in tables], rel=1e-9)
-
-
-@pytest.mark.parametrize(
-    "table", [(300, 10**6, 5000, 6000), (3, 10**6, 5000, 6000), (30, 10**6, 5000, 6000), (70, 1000, 600, 100)]
-)
-def test_tails_of_large_tables(table):
-    x, total, s, d = table
-    upper, lower = stats.hypergeom.sf(x - 1, total, s, d), stats.hypergeom.cdf(x, total, s, d)
-    found = fisher_two_sided(*torch.tensor([table]).T)
-    assert float(found) == pytest.approx(min(2 * (upper if x * total > s * d else lower), 1), rel=1e-7)
 
 
 def brute_force(plans: Plans, n: int) -> dict[tuple[int, ...], tuple[int, int, int, int]]:
@@ -247,22 +236,6 @@ def test_codes_do_not_overflow():
     assert counts == {(40, 51): (50, 25), (1, 2): (50, 25), (40, 2): (0, 25), (1, 51): (0, 25)}
 
 
-def test_repeats_are_merged():
-    """Within plans, never across; runs of one action then do not come first."""
-    probs = markov_probs(4, 2, 0, 1.5)
-    probs[torch.arange(16), torch.arange(16) % 4] = 0
-    alone = markov_plans(probs, 60, 12, 1).actions[:, 1:]
-    assert (alone[1:, 0] == alone[:-1, -1]).sum() > 10  # plans that begin as the one before them ended
-    plans = Plans(alone.repeat_interleave(torch.arange(11) % 3 + 1, 1), 4)
-    found = motifs(plans, (3, 4), collapse_repeats=True)
-    assert found == motifs(Plans(alone, 4), (3, 4))
-    assert len(found) > 20
-    chain = markov_plans(markov_probs(3, 1, 0), 20, 60, 0)
-    again = Plans(chain.actions.repeat_interleave(torch.arange(60) % 3 + 1, 1), 3)
-    assert any(m.corrected <= 0.05 for m in motifs(again, (3, 4)))
-    assert {len(set(m.actions[i : i + 2])) for m in motifs(again, collapse_repeats=True) for i in range(2)} == {2}
-
-
 def test_the_order_of_the_list():
     found = motifs(planted(4, (0, 1, 2, 3, 0), 0))
     kinds = [2 if m.corrected > 0.05 else int(m.ratio < 1) for m in found]
@@ -275,12 +248,10 @@ def test_the_order_of_the_list():
 
 
 def test_chunks_change_nothing(monkeypatch):
-    plans = planted(4, (2, 2, 0, 1), 1)
-    assert motifs(plans, chunk_size=7) == motifs(plans)
-    plans = plans[:30]
+    plans = planted(4, (2, 2, 0, 1), 1)[:30]
     whole, module = motifs(plans), sys.modules[fisher_two_sided.__module__]
+    monkeypatch.setattr(module, "CANDIDATES_AT_ONCE", 7)
     monkeypatch.setattr(module, "COUNTS_AT_ONCE", 1)  # one unit at a time
-    monkeypatch.setattr(module, "TAILS_AT_ONCE", 100)
     parts = motifs(plans)
     assert len(parts) == len(whole) > 0
     for one, other in zip(parts, whole, strict=True):
@@ -300,25 +271,18 @@ def test_chunks_change_nothing(monkeypatch):
 )
 def test_nothing_to_test(plans):
     assert motifs(plans) == []
-    assert motifs(plans, collapse_repeats=True) == []
 
 
-def test_bad_input():
-    plans = planted(4, (0, 1, 2), 0)
-    with refuses("lengths", "at least 2", "1"):
-        motifs(plans, (3, 1))
-    with refuses("lengths", "at least 3", "collapse_repeats", "2"):
-        motifs(plans, (2, 3), collapse_repeats=True)
-    with refuses("lengths", "[3, 3]"):
-        motifs(plans, (3, 3))
-    with refuses("lengths", "[]"):
-        motifs(plans, ())
-    with refuses("top", "0"):
-        motifs(plans, top=0)
-
-
-def test_lengths_are_a_list():
-    plans = Plans(torch.arange(60).view(6, 10) % 3, 3)
-    assert motifs(plans, lengths=np.array([3])) == motifs(plans, lengths=[3])
-    with refuses("`lengths` must be a list of numbers, got 3"):
-        motifs(plans, lengths=3)
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"lengths": (3, 1)}, "`lengths` must be at least 2, got 1"),
+        ({"lengths": (3, 3)}, "`lengths` must be different integers, one or more, got [3, 3]"),
+        ({"lengths": ()}, "`lengths` must be different integers, one or more, got []"),
+        ({"lengths": 3}, "lengths"),
+        ({"top": 0}, "top"),
+    ],
+)
+def test_what_is_refused(options, words):
+    with refuses(words):
+        motifs(planted(4, (0, 1, 2), 0), **options)

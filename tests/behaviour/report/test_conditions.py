@@ -2,21 +2,18 @@
 
 from dataclasses import replace
 
-import numpy as np
-import pandas as pd
 import pytest
 import torch
 
 from neuroprior import Plans
 from neuroprior.behaviour import compare_conditions
 from neuroprior.behaviour.report.conditions import DRAWN, condition_section
-from neuroprior.behaviour.report.figures import condition_figure
 from neuroprior.behaviour.report.part import LISTED, Part
 from neuroprior.behaviour.report.plan_report import report
 from neuroprior.behaviour.report.scores import evaluate_saved
 from neuroprior.priors import UniformPrior
-from tests.support.reports import QUICK
-from tests.support.sources import refuses, seeded
+from tests.support.reports import QUICK_IN_TWO
+from tests.support.sources import seeded
 from tests.support.studies import between, study, within
 
 NAMES = ["eat", "groom", "rear"]
@@ -65,14 +62,11 @@ def test_the_tables_hold_what_was_found(conditions):
     blocks = frames["condition_blocks"]
     right = (blocks["condition"] == blocks["classified"]).groupby(blocks["condition"]).mean().mean()
     assert right == pytest.approx(found.prediction.accuracy)
-    carried = frames["condition_sequences"]
-    assert carried["bits_per_1000"].sum() == pytest.approx(1000 * float(found.prediction.carried.sum()))
-    assert carried.set_index("sequence")["speaks_for"]["eat → groom"] == "drug 1"
 
 
 def test_stars_and_limits_of_the_printed_tables():
     section, frames = section_of(changed(between(12)))
-    tests, features, predicted, carried = section.tables
+    tests, features, predicted = section.tables
     assert tests.rows[0][0] == "all tests together"
     assert all(row[-1].endswith("*") == (float(row[-1].strip("*")) < 0.05) for row in tests.rows[1:])
     assert "Smallest possible p: 0.0022; corrected for 6 tests: 0.013." in tests.caption
@@ -81,7 +75,6 @@ def test_stars_and_limits_of_the_printed_tables():
     assert starred == frames["conditions"]["feature"][frames["conditions"]["significant"]].tolist()[:LISTED]
     assert [row[0] for row in predicted.rows] == ["drug 0", "drug 1"]
     assert [sum(map(int, row[1:])) for row in predicted.rows] == [6, 6]
-    assert len(carried.rows) == min(LISTED, len(frames["condition_sequences"]))
 
 
 def test_units_are_counted_by_their_condition_and_by_the_one_predicted():
@@ -97,9 +90,9 @@ def test_units_are_counted_by_their_condition_and_by_the_one_predicted():
 
 
 def test_a_report_has_the_section(tmp_path):
-    made = report(changed(between(12)), folds=2, out=tmp_path, sections=["file", "conditions"], **QUICK)
+    made = report(changed(between(12)), fits=QUICK_IN_TWO, out=tmp_path, sections=["file", "conditions"])
     assert made.lead.endswith(compare_conditions(changed(between(12)), generator=seeded(0)).verdict)
-    names = ["condition_tests", "conditions", "condition_blocks", "condition_sequences"]
+    names = ["condition_tests", "conditions", "condition_blocks"]
     assert {*names} <= {*made.tables}
     assert all((tmp_path / f"{name}.csv").exists() for name in names)
     assert "conditions" in made.figures
@@ -127,36 +120,6 @@ def test_plans_without_groups_or_names_that_are_those_of_columns():
     assert [row[0] for row in section.tables[2].rows] == names
 
 
-def figure_tables(num: int, units: int) -> tuple[pd.DataFrame, pd.DataFrame]:
-    names = [f"c{k}" for k in range(num)]
-    means = [(f, name, 0.5 + k, 0.4 + k, 0.6 + k) for f in ("a", "b") for k, name in enumerate(names)]
-    values = [
-        (f, u, name, 0.5 + k + 0.01 * u) for f in ("a", "b") for u in range(units) for k, name in enumerate(names)
-    ]
-    return (
-        pd.DataFrame(means, columns=["feature", "condition", "mean", "low", "high"]),
-        pd.DataFrame(values, columns=["feature", "unit", "condition", "value"]),
-    )
-
-
-@pytest.mark.parametrize("num", [2, 3])
-def test_the_figure_has_a_dot_for_each_unit_and_joins_those_of_one(num):
-    means, values = figure_tables(num, 5)
-    for paired in (False, True):
-        cells = condition_figure(means, values, paired).axes
-        assert [axes.get_title(loc="left") for axes in cells] == ["a", "b"]
-        for axes in cells:
-            dots = [line for line in axes.lines if line.get_marker() == "o"]
-            assert [len(line.get_xdata()) for line in dots] == [5] * num
-            assert np.concatenate([line.get_xdata() for line in dots]) == pytest.approx(
-                values[values["feature"] == "a"].sort_values(["condition", "unit"])["value"].tolist()
-            )
-            joined = [line for line in axes.lines if line.get_marker() == "None" and len(line.get_xdata()) == num]
-            own = [line for line in joined if len({*line.get_ydata()}) == num]
-            assert len(own) == 5 * paired
-            assert [label.get_text() for label in axes.get_yticklabels()] == [f"c{k}" for k in range(num)]
-
-
 def test_the_figure_shows_the_features_that_differ_most():
     """With the values of units, those of durations as geometric means, and the means of the table."""
     plans = changed(within(8))
@@ -177,8 +140,6 @@ def test_the_figure_shows_the_features_that_differ_most():
             assert sorted(dots[k]) == pytest.approx(sorted(values[found.design.label == k].tolist()))
             assert bars[k] == row[f"mean, {name}"]
     assert "durations" in set(features["family"])
-    with refuses("means"):
-        condition_figure(*(frame[:0] for frame in figure_tables(2, 3)))
 
 
 @pytest.mark.parametrize("conditions", [between(12), within(8)], ids=["between", "within"])

@@ -9,11 +9,22 @@ import torch
 
 from neuroprior.behaviour.analysis.comparison import DEPTH, score_bits, units
 from neuroprior.behaviour.report import fits
-from neuroprior.behaviour.report.fits import ACTIONS, COMBINED, CONTEXT, DURATIONS, KINDS, Design, Job, counted, split
+from neuroprior.behaviour.report.fits import (
+    ACTIONS,
+    COMBINED,
+    CONTEXT,
+    DURATIONS,
+    KINDS,
+    Design,
+    Job,
+    counted,
+    fit_and_score,
+    split,
+)
 from neuroprior.behaviour.report.scores import Evaluation, cross_validation, evaluate, jobs
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import folds, in_parts
-from neuroprior.priors import ContextTreePrior, GRUPrior, MarkovPrior, Prior
+from neuroprior.priors import ContextTreePrior, GRUPrior, MarkovPrior, Prior, StackedPrior
 from neuroprior.priors.counts import BACKOFFS_TRIED
 from tests.support.chains import markov_plans, markov_probs
 from tests.support.sources import refuses, seeded
@@ -148,27 +159,6 @@ def test_features_are_for_neural_models_alone(kind, tmp_path):
     torch.testing.assert_close(found.models[-1].bits, want)
 
 
-def test_calibration_and_samples_are_of_the_held_out_plans(tmp_path):
-    """The forecasts of all folds are counted once, and samples stand in the place of the first fold's plans."""
-    plans = chain()
-    found = evaluated(plans, tmp_path, skip=1)
-    first = split(plans, None, Design(2), 0)[1]
-    assert found.sampled.actions.equal(plans[first].actions)
-    for model in found.models:
-        sums = model.calibration.sums.sum((0, 1))
-        number = int(found.mask.sum())
-        assert sums.tolist() == pytest.approx([number, number, 3 * number], rel=1e-5)
-        assert model.generated.shape == (len(first), 7)
-        assert model.generated.max() < 3
-    *chains, tree = found.models[1:]
-    best = min(chains, key=lambda model: model.cost)
-    assert best != chains[0]
-    assert found.leading(ACTIONS) == [best, tree]
-    (one,) = found.models[0].calibration.bins
-    assert one.forecast == pytest.approx(1 / 3, abs=1e-6)
-    assert one.taken.mean == pytest.approx(1 / 3)
-
-
 def test_the_combined_prior_learns_its_weights_on_plans_that_its_experts_did_not_see(monkeypatch):
     """Actions are independent; a chain of order 6 knows by heart the plans that it counted, and no others."""
 
@@ -177,7 +167,7 @@ def test_the_combined_prior_learns_its_weights_on_plans_that_its_experts_did_not
 
     monkeypatch.setattr(fits, "fitted_experts", experts)
     drawn = torch.multinomial(torch.tensor([0.7, 0.2, 0.1]), 480, True, generator=seeded(0)).view(60, 8)
-    found = fits.fit_and_score(Plans(drawn, 3), Plans(drawn[:5], 3), Design(1), Job(0, COMBINED, ACTIONS))
+    found = fit_and_score(Plans(drawn, 3), Plans(drawn[:5], 3), Design(1), Job(0, COMBINED, ACTIONS))
     assert str(found["combined/how"]).split()[1:] == ["contexttree"]
 
 
@@ -188,44 +178,9 @@ def test_durations_of_other_held_out_plans_do_not_matter():
     design, job = Design(1, max_steps=1), Job(0, "gru", DURATIONS)
     test = Plans(plans.actions[:8], 3, plans.lengths[:8], durations=times[24:])
     other = replace(test, durations=times[24:] * torch.tensor([1.0] * 3 + [100.0] * 5)[:, None])
-    bits, again = (fits.fit_and_score(plans, some, design, job)["gru/bits"] for some in (test, other))
+    bits, again = (fit_and_score(plans, some, design, job)["gru/bits"] for some in (test, other))
     assert again[:3] == pytest.approx(bits[:3], abs=1e-6)
     assert abs(again[3:] - bits[3:]).max() > 1e-4
-
-
-@pytest.mark.parametrize("at_once", [1, 14, 25])
-def test_plans_are_scored_in_parts_as_a_whole(at_once, monkeypatch):
-    """Bits and forecasts of all parts count, also where a part has no action that counts."""
-    plans = chain()
-    prior, mask = MarkovPrior(3, 1).fit(plans), counted(plans, 2)
-    unit = units(plans, mask)
-    whole = fits.score_arrays(prior, plans, mask, unit)
-    assert whole["calibration"][..., 2].sum() == 3 * int(mask.sum())
-    monkeypatch.setattr(MarkovPrior, "actions_at_once", at_once)
-    assert not mask.any(1).all()
-    parts = fits.score_arrays(prior, plans, mask, unit)
-    for what, values in whole.items():
-        assert parts[what].reshape(-1).tolist() == pytest.approx(values.reshape(-1).tolist(), abs=1e-6)
-
-
-def test_samples_in_contexts_that_follow_from_actions(tmp_path):
-    """In a ring of four places; what is written beyond the ends of plans says nothing of where actions lead."""
-    actions = torch.randint(3, (24, 7), generator=seeded(0))
-    place = torch.arange(24)[:, None] % 4 + torch.nn.functional.pad((actions - 1).cumsum(1), (1, 0))[:, :-1]
-    plans = chain(context=place % 4)
-    plans = replace(plans, actions=actions, context=plans.context.where(plans.mask(), 3))
-    found = evaluated(plans, tmp_path, inputs=(CONTEXT,))
-    assert all(model.generated.shape == (12, 7) for model in found.models)
-    # Where a context leads to two others by the same action, samples have none.
-    other = replace(plans, context=context_of("index a step"))
-    assert all(model.generated is None for model in evaluated(other, tmp_path, inputs=(CONTEXT,)).models)
-
-
-def test_samples_in_a_context_that_is_only_seen_last():
-    """Where it leads is unknown; all actions may be taken in it. Twelve are equal by chance with 6e-6."""
-    plans = Plans(torch.randint(3, (24, 4), generator=seeded(0)), 3, context=torch.arange(4).repeat(24, 1))
-    found = fits.fit_and_score(plans, plans[:12], Design(1), Job(0, "counts", CONTEXT))
-    assert len(set(found["markov-0/generated"][:, -1])) > 1
 
 
 @pytest.mark.parametrize("skip", [0, 2])
@@ -258,7 +213,7 @@ def test_few_plans_have_scores_and_short_lags(plans, tmp_path):
 def test_information_by_lag_is_of_the_actions_that_count(skip):
     """Of plans of 12 actions: those after the first `skip` that have three before them."""
     plans, design = replace(chain(10, 12), lengths=None), Design(2, skip=skip, reach=3)
-    arrays = fits.fit_and_score(plans, None, design, Job(0, "lags", ACTIONS))
+    arrays = fit_and_score(plans, None, design, Job(0, "lags", ACTIONS))
     assert arrays["markov/actions"].sum(1).tolist() == [5 * (12 - max(skip, 3))] * 4
 
 
@@ -324,26 +279,65 @@ def test_a_damaged_result_is_named(tmp_path):
             run.do([job], processes=1)
 
 
-def test_the_reference_is_the_best_model_wherever_it_stands(tmp_path):
-    """Of a chain of order 1 the best is not the last of the table; differences are from it."""
-    found = evaluated(chain(60, 12), tmp_path)
-    costs = [model.cost for model in found.models]
-    assert costs.index(min(costs)) not in (0, len(costs) - 1)
-    assert found.reference[0] is found.models[costs.index(min(costs))] is found.best
-    table = found.table()
-    assert table["more"].tolist() == pytest.approx([cost - min(costs) for cost in costs])
-    assert found.reference[1] == f"{table['model'][costs.index(min(costs))]} (actions)"
+def drawn(num: int, length: int, actions: int = 3, seed: int = 0, **more) -> Plans:
+    return Plans(torch.randint(actions, (num, length), generator=seeded(seed)), actions, **more)
 
 
-def test_a_gain_is_over_one_action_less(tmp_path):
-    """At each lag: the bits with all nearer actions known less those with this one as well, on the same actions."""
-    plans, design = chain(60, 12), Design(2, max_steps=STEPS, reach=3)
-    todo = jobs(design, ["counts", "lags"], [ACTIONS])
-    results = cross_validation(tmp_path, plans, None, design).do(todo, processes=1)
-    arrays = results[[job.kind for job in todo].index("lags")]
-    bits, actions = (arrays[f"markov/{what}"].sum(1) for what in ("bits", "actions"))
-    gains = evaluate(plans, None, design, todo, results).gains
-    assert gains["lag"].tolist() == [1, 2, 3]
-    assert gains["bits"].tolist() == pytest.approx(((bits[:-1] - bits[1:]) / actions[1:]).tolist())
-    assert gains["units"].tolist() == [arrays["markov/bits"].shape[1]] * 3
-    assert ((gains["low"] < gains["bits"]) & (gains["bits"] < gains["high"])).all()
+def test_the_networks_among_experts_are_counted_again_on_all_that_is_learned(monkeypatch):
+    """The stacked prior learned its weights beside validation plans; its counts are then those of all plans."""
+    made = []
+
+    def experts(learned: Plans, *others: object) -> list[StackedPrior]:
+        stacked = StackedPrior(3).fit(learned, max_steps=1, progress=False, generator=seeded(0))
+        made.append((stacked, stacked.action_log_probs(test)))
+        return [stacked]
+
+    plans, test = drawn(20, 6), drawn(4, 6, seed=1)
+    monkeypatch.setattr(fits, "fitted_experts", experts)
+    found = fit_and_score(plans, test, Design(1), Job(0, COMBINED, ACTIONS))["stacked/bits"]
+    ((stacked, before),) = made
+    after = -stacked.recount(plans).action_log_probs(test).detach() / math.log(2)
+    assert found == pytest.approx(after.numpy(), abs=1e-6)
+    assert abs(found + before.detach().numpy() / math.log(2)).max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("effort", "apart"),
+    [("fast", {"stacked", "transformer"}), ("standard", {"transformer"}), ("full", set())],
+)
+def test_the_networks_among_experts_are_fitted_once(effort, apart, monkeypatch):
+    """The job of the combined prior trains what its effort says, and scores it as models of their own."""
+    trained = []
+    plans, design = drawn(20, 6), Design(2, max_steps=1, effort=effort)
+    monkeypatch.setattr("neuroprior.training.train", lambda prior, *_: trained.append(type(prior)))
+    networks = {"gru", "stacked", "transformer"}
+    todo = jobs(design, [*networks, COMBINED, "counts"], [ACTIONS])
+    assert {job.kind for job in todo} == {COMBINED, "counts"} | apart
+    found = fit_and_score(plans, None, design, Job(0, COMBINED, ACTIONS))
+    assert {name.removesuffix("/bits") for name in found if name.endswith("/bits")} == {COMBINED} | networks - apart
+    assert len(trained) == {"fast": 1, "standard": 2, "full": 3}[effort]
+
+
+def test_the_reach_of_lags_is_half_of_the_shorter_plans():
+    """Learned from plans of 12 actions and scored on plans of 6, or the other way round: 0 to 3 known ones."""
+    long, short = drawn(20, 12), drawn(6, 6, seed=1)
+    for plans, test in ((long, short), (short, long[:6])):
+        arrays = fit_and_score(plans, test, Design(1, reach=5), Job(0, "lags", ACTIONS))
+        assert arrays["markov/bits"].shape == (4, 6)
+    assert fit_and_score(drawn(20, 1), short, Design(1), Job(0, "lags", ACTIONS)) == {}
+
+
+def test_all_pieces_and_all_lags_are_scored():
+    plans, design = drawn(40, 12), Design(2, reach=3, max_steps=1)
+    for kind, name in (("lags", "markov"), ("gru-lags", "gru")):
+        arrays = fit_and_score(plans, None, design, Job(0, kind, ACTIONS))
+        assert arrays[f"{name}/actions"].sum(1).tolist() == [20 * 9] * 4
+
+
+def test_a_context_that_tells_the_action_leaves_nothing_to_the_past():
+    """Nothing known but the context: hardly a bit; without it all of the bits of three equally frequent actions."""
+    context = torch.randint(3, (60, 6), generator=seeded(0))
+    plans = Plans(context, 3, context=context)
+    for inputs, low, high in ((CONTEXT, 0, 0.1), (ACTIONS, 1.5, 1.7)):
+        arrays = fit_and_score(plans, None, Design(2, reach=2), Job(0, "lags", inputs))
+        assert low < arrays["markov/bits"][0].sum() / arrays["markov/actions"][0].sum() < high

@@ -14,19 +14,6 @@ from neuroprior.behaviour.report.part import p_text
 from tests.support.sources import refuses
 
 
-def test_files_hold_renamed_columns_under_both_names(tmp_path):
-    frame = pd.DataFrame({"context": ["none", "initial"], "bits": [1.5, None]})
-    document = Document("", "", [], {"rows": frame}, former_names={"context": "sees"})
-    write_document(document, tmp_path)
-    rows = json.loads((tmp_path / "results.json").read_text())["rows"]
-    assert rows == [
-        {"context": "none", "bits": 1.5, "sees": "none"},
-        {"context": "initial", "bits": None, "sees": "initial"},
-    ]
-    assert pd.read_csv(tmp_path / "rows.csv")["sees"].tolist() == ["none", "initial"]
-    assert list(frame) == ["context", "bits"]
-
-
 def test_a_table_that_is_empty_now_leaves_no_file_of_an_earlier_run(tmp_path):
     full = pd.DataFrame({"bits": [1.5]})
     write_document(Document("", "", [], {"one": full, "two": full}), tmp_path)

@@ -18,10 +18,10 @@ from neuroprior.behaviour.report.scores import evaluate_saved
 from neuroprior.behaviour.report.sections import SECTIONS
 from neuroprior.plans import BLOCKS, Plans, write_plans
 from neuroprior.priors import UniformPrior
-from tests.support.reports import QUICK
+from tests.support.reports import QUICK_IN_TWO
 from tests.support.sources import refuses, seeded
 
-ONLY = {"models": ["counts"], "folds": 2, "processes": 1, "sections": ["durations"]}
+ONLY = {"fits": QUICK_IN_TWO, "sections": ["durations"]}
 
 
 def timed(telling: bool, num_plans: int = 24, length: int = 60, seed: int = 0, num_actions: int = 3) -> Plans:
@@ -197,12 +197,6 @@ def test_few_units_give_no_verdict():
     assert "*" not in "".join(cell for table in made.tables for row in table.rows for cell in row)
 
 
-def test_one_plan_is_cut_in_time():
-    plans = timed(True, 1, 600)
-    frame = tables(replace(plans, group=None))["next_by_duration"]
-    assert frame.iloc[0]["low"] > 0
-
-
 def test_without_durations_there_is_no_section():
     plans = timed(False)
     for durations in (None, torch.full_like(plans.durations, nan), torch.zeros_like(plans.durations)):
@@ -213,16 +207,16 @@ def test_without_durations_there_is_no_section():
 def test_networks_with_durations():
     """They know more than those without, and the table says so."""
     plans = timed(True, 64, 12)
-    quick = QUICK | {"models": ["gru"], "inputs": ["actions", "durations"], "max_steps": 60}
-    made = report(plans, folds=2, **quick, sections=["scores", "durations"])
+    fits = replace(QUICK_IN_TWO, models=["gru"], inputs=["actions", "durations"], max_steps=60)
+    made = report(plans, fits=fits, sections=["scores", "durations"])
     bits = made.tables["plans"].set_index("context")["bits_per_action"]
     assert bits["actions and durations"] < bits["actions"] - 0.1
     row = made.tables["next_by_duration"].set_index("model").loc["gru"]
     assert row["gain"] == pytest.approx(bits["actions"] - bits["actions and durations"])
-    with refuses("no durations"):
-        report(replace(plans, durations=None), inputs=["durations"], **ONLY)
-    with refuses("durations are an input of combined, transformer, gru"):
-        report(plans, inputs=["durations"], **ONLY)
+    with refuses("`inputs` must not hold durations"):
+        report(replace(plans, durations=None), fits=replace(QUICK_IN_TWO, inputs=["durations"]))
+    with refuses("`models` must hold one of combined, transformer, gru"):
+        report(plans, fits=replace(QUICK_IN_TWO, inputs=["durations"]), sections=["durations"])
 
 
 def test_at_most_some_panels_are_drawn():
@@ -245,9 +239,10 @@ def test_rounded_durations_have_no_empty_bins():
 
 
 def test_the_parts_of_a_single_plan_are_its_units():
-    frames = tables(replace(timed(False, 1, 600), group=None))
+    frames = tables(replace(timed(True, 1, 600), group=None))
     for name in ("duration_laws", "next_by_duration"):
         assert frames[name]["units"].tolist() == [BLOCKS] * len(frames[name])
+    assert frames["next_by_duration"].iloc[0]["low"] > 0
 
 
 def test_gains_are_those_of_durations_above_0():

@@ -7,18 +7,14 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 
 from neuroprior import Plans
-from neuroprior.behaviour.report.drawing import KINDS, MARKOV, SPARE, colors, lines
+from neuroprior.behaviour.report.drawing import FEWER, KINDS, MARKOV, MORE, SPARE, colors, lines
 from neuroprior.behaviour.report.figures import (
     STRIPS,
-    calibration_figure,
     condition_figure,
     drift_figure,
     dwell_figure,
     ethogram_figure,
-    lag_figure,
     motif_figure,
-    order_figure,
-    score_figure,
 )
 
 
@@ -39,25 +35,6 @@ def test_dwell_times():
         (law,) = axes.lines
         assert law.get_xydata().tolist() == [[2.0, 0.4], [6.0, 0.3]]
         assert (axes.get_xscale(), axes.get_xlim()) == ("log", (1.0, 9.0))
-
-
-def test_calibration():
-    """A panel a model; a dot at forecast and share, its area by the number, and the interval upright through it."""
-    bins = [("gru", "actions", 0.1, 0.2, 0.05, 0.3, 100), ("gru", "actions", 0.8, 0.7, 0.6, 0.9, 25)]
-    bins.append(("gru", "actions and context", 0.5, 0.4, 0.3, 0.6, 7))
-    columns = ["model", "context", "forecast", "taken", "low", "high", "number"]
-    figure = calibration_figure(pd.DataFrame(bins, columns=columns))
-    assert [title(axes) for axes in figure.axes] == ["gru", "gru, with context"]
-    bars, dots = figure.axes[0].collections
-    assert [segment.tolist() for segment in bars.get_segments()] == [
-        [[0.1, 0.05], [0.1, 0.3]],
-        [[0.8, 0.6], [0.8, 0.9]],
-    ]
-    assert dots.get_offsets().tolist() == [[0.1, 0.2], [0.8, 0.7]]
-    assert dots.get_sizes().tolist() == pytest.approx([8 + 70, 8 + 35])
-    assert figure.axes[1].collections[1].get_offsets().tolist() == [[0.5, 0.4]]
-    assert figure.axes[0].lines[0].get_xydata().tolist() == [[0, 0], [1, 1]]
-    assert (figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()) == ("forecast probability", "share taken")
 
 
 @pytest.mark.parametrize("paired", [False, True])
@@ -89,70 +66,6 @@ def test_conditions_in_an_order_of_their_own(paired):
         assert {line.get_color() for line in (dots, bar, mean)} == {dots.get_color()}
 
 
-def test_motifs_have_their_counts():
-    """From the top down: name, ratio, interval and count of each row stand at one height."""
-    rows = [("a b", 4.0, 2.0, 5.0, 1234), ("b a", 0.5, 0.3, 0.8, 7), ("c c", 1.5, 1.2, 1.9, 56)]
-    axes = motif_figure(pd.DataFrame(rows, columns=["sequence", "ratio", "low", "high", "count"])).axes[0]
-    heights = dict(zip((label.get_text() for label in axes.get_yticklabels()), axes.get_yticks(), strict=True))
-    assert list(heights) == ["c c", "b a", "a b"]
-    assert sorted(heights.values()) == list(heights.values())
-    dots = {line.get_ydata()[0]: line.get_xdata()[0] for line in axes.lines if line.get_marker() == "o"}
-    spans = {line.get_ydata()[0]: list(line.get_xdata()) for line in axes.lines[1:] if line.get_marker() == "None"}
-    counts = {text.get_position()[1]: text.get_text() for text in axes.texts if text.get_text() != "count"}
-    for name, ratio, low, high, count in rows:
-        at = heights[name]
-        assert (dots[at], spans[at], counts[at]) == (ratio, [low, high], f"{count:,}")
-
-
-def test_orders_that_are_left_out():
-    """A chain that was too large has no row: what is drawn, and ringed, stands at the order, not at the row."""
-    orders = pd.DataFrame({"order": [1, 2, 4], "context": "actions", "bic_bits": [2.0, 1.8, 1.5]})
-    orders["aic_bits"] = [1.9, 1.6, 1.7]
-    held_out = [("markov-4", 1.4, 1.3, 1.5), ("uniform", 3.0, 3.0, 3.0), ("markov-2", 1.7, 1.6, 1.8)]
-    scores = pd.DataFrame(held_out, columns=["model", "bits_per_action", "low", "high"]).assign(context="actions")
-    axes = order_figure(orders, scores).axes[0]
-    curves = {line.get_label(): line for line in axes.lines if line.get_markersize() != 13}
-    assert {name: line.get_xydata().tolist() for name, line in curves.items()} == {
-        "BIC": [[1, 2.0], [2, 1.8], [4, 1.5]],
-        "AIC": [[1, 1.9], [2, 1.6], [4, 1.7]],
-        "held out, actions": [[2, 1.7], [4, 1.4]],
-    }
-    rings = [line for line in axes.lines if line.get_markersize() == 13]
-    assert [line.get_xydata().tolist() for line in rings] == [[[4, 1.5]], [[2, 1.6]], [[4, 1.4]]]
-    assert [line.get_markeredgecolor() for line in rings] == [line.get_color() for line in curves.values()]
-    assert curves["held out, actions"].get_color() == next(iter(lines(["held out, actions"])))[0]
-    ends = axes.collections[-1].get_paths()[0].vertices
-    assert {tuple(end) for end in ends.tolist()} == {(2, 1.6), (2, 1.8), (4, 1.3), (4, 1.5)}
-    assert not [
-        line for line in order_figure(orders, scores, ringed=False).axes[0].lines if line.get_markersize() == 13
-    ]
-
-
-@pytest.mark.parametrize(
-    ("make", "frames", "words"),
-    [
-        (score_figure, ["model context low high"], "scores: .*; bits_per_action missing"),
-        (lag_figure, ["model lag bits low high critical_value"], "lags: .*; what, context missing"),
-        (
-            order_figure,
-            ["order", "model context bits_per_action low high"],
-            "orders: .*; context, bic_bits, aic_bits m",
-        ),
-        (order_figure, ["order context bic_bits aic_bits", "model"], "scores: .*; context, bits_per_action"),
-        (dwell_figure, ["action"], "dwell: .*; number, zero"),
-        (calibration_figure, ["model context"], "calibration: .*; forecast"),
-        (condition_figure, ["feature", "feature"], "means: .*; condition"),
-        (condition_figure, ["feature condition mean low high", "feature"], "values: .*; unit, condition, value m"),
-        (motif_figure, ["sequence"], "motifs: .*; ratio, low, high, count missing"),
-        (drift_figure, ["what name", "index bits"], "drift: .*; bits, low, high missing"),
-        (drift_figure, ["what name bits low high", "index"], "plans: .*; bits missing"),
-    ],
-)
-def test_tables_without_a_column_are_refused(make, frames, words):
-    with pytest.raises(ValueError, match=words):
-        make(*(pd.DataFrame([dict.fromkeys(columns.split(), 1)]) for columns in frames))
-
-
 def test_drift_stands_at_the_middles_of_parts_and_at_the_numbers_of_plans():
     places = [("place", f"part {n}", bits, bits - 0.1, bits + 0.1) for n, bits in enumerate((2.0, 1.5, 1.2, 1.0), 1)]
     groups = [
@@ -174,16 +87,6 @@ def test_drift_stands_at_the_middles_of_parts_and_at_the_numbers_of_plans():
     assert bars == [pytest.approx([bits - 0.2, bits + 0.3]) for bits in (1.0, 1.5, 2.0)]
 
 
-def test_intervals_end_where_the_axis_does():
-    """Of sequences an interval may be wide: the axis is by the ratios."""
-    rows = [("a b c", 2.0, 0.01, 400.0, 9), ("c b a", 0.5, 0.3, 0.6, 8)]
-    (axes,) = motif_figure(pd.DataFrame(rows, columns=["sequence", "ratio", "low", "high", "count"])).axes
-    bars = [[*line.get_xdata()] for line in axes.lines if len(line.get_xdata()) == 2][1:]  # the first is at 1
-    below, above = sorted(bars, key=lambda bar: bar[1])
-    assert below == pytest.approx([2**-1.25, 0.6])
-    assert above == pytest.approx([2**-1.25, 2**1.25])
-
-
 def test_plans_stand_in_their_own_order_and_not_by_name():
     """One action a plan, so that each row has one colour; parts of a plan are in one row."""
     actions = torch.tensor([[0, 0], [1, 1], [2, 2], [1, 1]])
@@ -195,10 +98,28 @@ def test_plans_stand_in_their_own_order_and_not_by_name():
         assert [*dict.fromkeys(shown)] == [to_rgb(STRIPS[action]) for action in want]
 
 
-def test_models_have_the_colours_of_their_orders():
-    assert [*colors(["markov-0", "markov-1", "markov", "Markov-2, with context", "markov-40"])] == [
-        *(MARKOV[k] for k in (0, 1, 1, 2)),
-        MARKOV[-1],
-    ]
-    others = [*colors(["mine", "gru", "yours", "uniform"])]
-    assert others == [SPARE[0], KINDS["gru"], SPARE[1], KINDS["uniform"]]
+def test_motifs_stand_where_they_are():
+    """From the top down name, ratio, interval and count; what is beyond the ratios is cut, or an arrow at the edge."""
+    rows = [("a b", 4.0, 0.01, 5.0, 1234), ("b a", 0.5, 0.3, 0.8, 7), ("c c", 0.0, 0.0, 0.4, 0)]
+    axes = motif_figure(pd.DataFrame(rows, columns=["sequence", "ratio", "low", "high", "count"])).axes[0]
+    heights = dict(zip((label.get_text() for label in axes.get_yticklabels()), axes.get_yticks(), strict=True))
+    assert list(heights) == ["c c", "b a", "a b"]
+    assert sorted(heights.values()) == list(heights.values())
+    marks = {line.get_ydata()[0]: line for line in axes.lines if line.get_marker() in ("o", "<")}
+    spans = {line.get_ydata()[0]: list(line.get_xdata()) for line in axes.lines[1:] if line.get_marker() == "None"}
+    counts = {text.get_position()[1]: text.get_text() for text in axes.texts if text.get_text() != "count"}
+    edge = 2**-2.5
+    for (name, ratio, _, _, count), color in zip(rows, (MORE, FEWER, FEWER), strict=True):
+        mark = marks[heights[name]]
+        assert (mark.get_xdata()[0], mark.get_color()) == (pytest.approx(max(ratio, edge)), color)
+        assert counts[heights[name]] == f"{count:,}"
+    assert spans == {heights["a b"]: [pytest.approx(edge), 5.0], heights["b a"]: [0.3, 0.8]}
+    assert marks[heights["c c"]].get_marker() == "<"
+
+
+def test_colors_and_lines_are_those_of_the_kind_of_model():
+    known = {"uniform": KINDS["uniform"], "markov-0": MARKOV[0], "markov-2, context": MARKOV[2], "markov": MARKOV[1]}
+    known |= {"Markov-12": MARKOV[-1], "Context tree": KINDS["tree"], "GRU": KINDS["gru"], "this": SPARE[0]}
+    known |= {"transformer": KINDS["transformer"], "combined": KINDS["combined"], "that": SPARE[1]}
+    assert list(colors([*known])) == [*known.values()]
+    assert list(lines(["gru", "gru, context"])) == [(KINDS["gru"], "-"), (KINDS["gru"], "--")]

@@ -4,21 +4,22 @@ import math
 from dataclasses import replace
 from typing import Any
 
-import matplotlib.figure
 import pytest
 import torch
 
-from neuroprior import Plans, write_plans
+from neuroprior import Plans
+from neuroprior.behaviour.report import plan_report
 from neuroprior.behaviour.report.document import Document
-from neuroprior.behaviour.report.page import FigureBox, Section, write_page
+from neuroprior.behaviour.report.options import FitOptions, ReadOptions
 from neuroprior.behaviour.report.plan_report import report
 from neuroprior.priors import MarkovPrior, UniformPrior, save
 from neuroprior.priors.scoring import keep_learned
 from tests.support.chains import markov_plans, markov_probs
-from tests.support.reports import QUICK
-from tests.support.sources import refuses, seeded
+from tests.support.reports import QUICK, QUICK_IN_TWO
+from tests.support.sources import seeded
 
-SCORES: dict[str, Any] = QUICK | {"sections": ["scores"]}
+SCORES: dict[str, Any] = {"fits": QUICK, "sections": ["scores"]}
+IN_TWO: dict[str, Any] = {"fits": QUICK_IN_TWO, "sections": ["scores"]}
 
 
 def chain(num: int = 12, length: int = 8, seed: int = 1, **more: Any) -> Plans:
@@ -80,7 +81,7 @@ def test_what_has_no_actions_is_left_out_and_counted():
     plans = chain(length=4)
     empty = replace(plans, lengths=torch.tensor([0, 4, 4, 0, 4, 0, 4, 4, 4, 4, 4, 4]))
     others = replace(plans[empty.mask().any(1)], lengths=None)
-    made, whole = (report(some, folds=2, **SCORES) for some in (empty, others))
+    made, whole = (report(some, **IN_TWO) for some in (empty, others))
     assert made.settings["plans without actions, left out"] == 3
     assert "plans without actions, left out" not in whole.settings
     assert made.frames["plans"]["bits_per_action"].tolist() == whole.frames["plans"]["bits_per_action"].tolist()
@@ -89,7 +90,7 @@ def test_what_has_no_actions_is_left_out_and_counted():
 def test_a_single_plan_is_cut_for_scores_and_described_whole():
     """What does not count is at the beginning of the plan, not of each part."""
     plans = chain(1, 300)
-    made = report(plans, skip=10, folds=2, **QUICK | {"sections": ["file", "scores"]})
+    made = report(plans, skip=10, fits=QUICK_IN_TWO, sections=["file", "scores"])
     assert made.results["file"]["plans"] == 1
     assert made.results["file"]["longest"] == 300
     assert made.settings["cut"]
@@ -98,54 +99,29 @@ def test_a_single_plan_is_cut_for_scores_and_described_whole():
     assert bits(made, "uniform") == pytest.approx(math.log2(3), abs=1e-5)
 
 
-@pytest.fixture
-def asked(monkeypatch) -> dict[str, Any]:
-    """The kinds of models that a report asks for, after which it is interrupted, and its design."""
-    from neuroprior.behaviour.report import plan_report
-
-    found: dict[str, Any] = {}
+@pytest.mark.parametrize(
+    ("more", "sections", "kinds"),
+    [
+        ({"models": ["counts"]}, ["lags"], "counts, lags"),
+        ({"models": ["gru"]}, ["lags"], "gru, lags, gru-lags"),
+        ({}, ["scores"], "counts, gru, transformer, stacked, combined"),
+        ({"effort": "full"}, ["scores"], "counts, gru, transformer, stacked, combined"),
+        ({"effort": "fast"}, ["scores"], "counts, gru, combined"),
+        ({"effort": "fast", "models": ["stacked", "combined"]}, ["scores"], "stacked, combined"),
+    ],
+)
+def test_models_and_effort_decide_what_is_fitted(more, sections, kinds, monkeypatch):
+    asked: dict[str, Any] = {}
 
     def stop(design, kinds, inputs):
-        found.update(design=design, kinds=", ".join(kinds))
+        asked.update(design=design, kinds=", ".join(kinds))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(plan_report, "jobs", stop)
-    return found
-
-
-@pytest.mark.parametrize(("models", "kinds"), [(["counts"], "counts, lags"), (["gru"], "gru, lags, gru-lags")])
-def test_information_by_lag_is_that_of_counts_and_of_networks_where_there_are_any(models, kinds, asked):
     with pytest.raises(KeyboardInterrupt):
-        report(chain(), models=models, max_steps=3, processes=1)
-    assert asked["kinds"] == kinds
-
-
-@pytest.mark.parametrize(
-    ("more", "kinds"),
-    [
-        ({}, "counts, gru, transformer, stacked, combined"),
-        ({"effort": "full"}, "counts, gru, transformer, stacked, combined"),
-        ({"effort": "fast"}, "counts, gru, combined"),
-        ({"effort": "fast", "models": ["stacked", "combined"]}, "stacked, combined"),
-    ],
-)
-def test_effort_decides_which_models_are_fitted_where_none_are_given(more, kinds, asked):
-    with pytest.raises(KeyboardInterrupt):
-        report(chain(), sections=["scores"], **more)
+        report(chain(), sections=sections, fits=FitOptions(**more))
     assert asked["kinds"] == kinds
     assert asked["design"].effort == more.get("effort", "standard")
-
-
-@pytest.mark.parametrize("more", [{"models": ["gru"]}, {"priors": {"even": UniformPrior(3)}}])
-def test_effort_without_a_combined_prior_to_fit_is_said(more):
-    with refuses("effort"):
-        report(chain(), effort="full", **more)
-
-
-@pytest.mark.parametrize("effort", ["quick", ["fast"]])
-def test_an_unknown_effort_is_said(effort):
-    with refuses("effort", "one of fast, standard, full", f"got {effort!r}"):
-        report(chain(), effort=effort)
 
 
 @pytest.mark.parametrize("skip", [0, 3])
@@ -176,35 +152,13 @@ def test_options_of_files_reach_the_reader(tmp_path):
             rows.append(f"s{plan},{'' if (plan, t) == (0, 2) else 'abc'[action]},{at},{at + 1}")
     (tmp_path / "plans.csv").write_text("\n".join(rows) + "\n")
     columns = {"plan": "session", "action": "behaviour", "start": "begin", "stop": "end"}
-    only: dict[str, Any] = {"columns": columns, "priors": {"none": UniformPrior(3)}, "sections": ["file"]}
-    facts = {}
-    for how in ({}, {"max_gap": 5}, {"merge_repeats": True}):
-        facts[str(how)] = report(tmp_path / "plans.csv", **only, **how).results["file"]
-    plain, gap, merged = facts.values()
+
+    def facts(num_actions: int = 3, **options: Any) -> dict[str, Any]:
+        reading, priors = ReadOptions(columns, **options), {"none": UniformPrior(num_actions)}
+        return report(tmp_path / "plans.csv", priors=priors, reading=reading, sections=["file"]).results["file"]
+
+    plain, gap, merged = facts(), facts(max_gap=5), facts(merge_repeats=True)
     assert (plain["plans"], gap["plans"]) == (9, 17)
     assert merged["actions"] < plain["actions"] == gap["actions"] == 95
-    labelled = report(tmp_path / "plans.csv", **only | {"priors": {"none": UniformPrior(4)}}, missing="label")
-    assert labelled.results["file"]["actions"] == 96
-    assert labelled.results["file"]["kinds of actions"] == 4
-
-
-def test_figures_of_all_sections_have_ids_of_their_own(tmp_path):
-    def box() -> FigureBox:
-        figure = matplotlib.figure.Figure(figsize=(2, 2))
-        figure.subplots().plot([0, 1], [1, 0], "o")
-        return FigureBox(figure, "caption", "alt")
-
-    sections = [Section("One", figures=[box(), box()]), Section("Two", figures=[box()])]
-    write_page(tmp_path / "page.html", "Title", "Lead", sections, {})
-    text = (tmp_path / "page.html").read_text()
-    ids = [part.split('"')[0] for part in text.split(' id="')[1:]]
-    assert len(ids) > 20
-    assert len(set(ids)) == len(ids)
-
-
-def test_plans_in_memory_are_those_of_their_file(tmp_path):
-    plans = chain(context=torch.arange(12) % 2, group=torch.arange(12) % 4)
-    write_plans(plans, tmp_path / "plans.npz")
-    one, two = (report(given, folds=2, **SCORES) for given in (plans, tmp_path / "plans.npz"))
-    assert one.frames["plans"].equals(two.frames["plans"])
-    assert (one.title, two.title) == ("Plans", "Plans in plans.npz")
+    labelled = facts(4, missing="label")
+    assert (labelled["actions"], labelled["kinds of actions"]) == (96, 4)

@@ -8,14 +8,13 @@ import pandas as pd
 import pytest
 import torch
 
-from neuroprior.behaviour.analysis.comparison import score_bits, units
-from neuroprior.behaviour.report.fits import ACTIONS, CONTEXT, DURATIONS, Design, Job, score_arrays
+from neuroprior.behaviour.analysis.comparison import action_bits, score_bits
+from neuroprior.behaviour.report.fits import ACTIONS, CONTEXT, DURATIONS, Design, Job
 from neuroprior.behaviour.report.scores import (
     Evaluation,
     Model,
     evaluate,
     evaluate_saved,
-    jobs,
     load_arrays,
     save_arrays,
 )
@@ -32,7 +31,7 @@ MASK = PLANS.mask()
 def model(name: str, bits: list[float], inputs: str = ACTIONS, mask: torch.Tensor = MASK) -> Model:
     """A model that takes so many bits for each action of each of the six plans."""
     each = torch.tensor(bits, dtype=torch.float64)[:, None] * mask
-    return Model(name, inputs, "", each, score_bits(name, inputs, each, PLANS, mask), None)
+    return Model(name, inputs, "", each, score_bits(name, inputs, each, PLANS, mask))
 
 
 def evaluation(*models: Model, reference: int = 0) -> Evaluation:
@@ -70,37 +69,17 @@ def test_there_is_no_difference_between_scores_of_other_actions():
     assert second["bits_per_action"] == pytest.approx(1)
 
 
-def test_figures_show_the_best_chain_of_an_input():
-    models = [model("uniform", [3.0] * 6), model("markov-1", [2.0] * 6), model("markov-2", [1.0] * 6)]
-    models += [model("markov-3", [1.5] * 6), model("gru", [1.2] * 6), model("gru", [0.5] * 6, CONTEXT)]
-    made = evaluation(*models)
-    assert made.leading(ACTIONS) == [models[2], models[4]]
-    assert made.leading(CONTEXT) == [models[5]]
-    assert made.leading(DURATIONS) == []
-    assert made.best is models[5]
-
-
-def test_jobs_are_the_slowest_first():
-    made = [str(job) for job in jobs(Design(2), ["counts", "gru", "lags"], [ACTIONS, DURATIONS])]
-    gru = ["fold0-gru-durations", "fold0-gru", "fold1-gru-durations", "fold1-gru"]
-    assert made == [*gru, "fold0-lags", "fold0-counts", "fold1-counts"]
-    combined = jobs(Design(1), ["combined", "gru", "stacked", "transformer", "counts"], [ACTIONS])
-    assert [job.kind for job in combined] == ["combined", "transformer", "counts"]
-
-
 def results(*named: tuple[str, str], number: int, bits: float) -> dict[str, np.ndarray]:
     """Made-up arrays of models, given by name and settings: so many bits for each action of each plan."""
     found = {}
     for place, (name, how) in enumerate(named):
         found[f"{name}/how"] = np.array(how)
         found[f"{name}/bits"] = np.full((number, 4), bits + 10 * place, dtype=np.float32)
-        found[f"{name}/calibration"] = np.full((7, 2, 3), bits)
-        found[f"{name}/generated"] = np.full((number, 4), int(bits))
     return found
 
 
 def test_the_results_of_folds_are_put_together():
-    """Each fold's where its plans stand; what a model lacks in a fold leaves it out; samples of the first fold."""
+    """Each fold's where its plans stand; what a model lacks in a fold leaves it out."""
     design = Design(3, skip=1)
     held_out = [index for _, index in folds(PLANS, 3, 0)]
     assert torch.cat(held_out).tolist() != [*range(6)]
@@ -117,9 +96,7 @@ def test_the_results_of_folds_are_put_together():
     for fold, index in enumerate(held_out):
         assert (tree.bits[index] == fold).all()
     assert tree.how == "deep"
-    assert (tree.calibration.sums == 0 + 1 + 2).all()
-    assert (tree.generated == 0).all()
-    assert made.sampled.actions.equal(PLANS.actions[held_out[0]])
+    assert made.first_fold.actions.equal(PLANS.actions[held_out[0]])
     assert made.mask.equal(torch.arange(4).expand(6, 4) >= 1)
     assert tree.cost == pytest.approx(1)  # as many plans in each fold: the mean of 0, 1 and 2
     assert made.reference == (tree, "context tree (actions)")
@@ -159,9 +136,7 @@ def test_saved_priors_are_compared_with_the_first():
     assert made.models[0].cost == pytest.approx(math.log2(3))
     for one in made.models:
         assert one.score.actions.tolist() == [9, 9]
-        assert one.calibration.sums[..., 2].sum((1,)).tolist()[:3] == [27, 27, 0]
-    due = score_arrays(priors["a"], plans, made.mask, units(plans, made.mask))["bits"]
-    assert made.models[1].bits.numpy() == pytest.approx(due)
+    assert made.models[1].bits.equal(action_bits(priors["a"], plans))
 
 
 def test_a_saved_prior_of_durations_says_so():

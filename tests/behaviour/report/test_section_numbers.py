@@ -19,21 +19,16 @@ from neuroprior.behaviour import (
     by_position,
     motifs,
     mutual_information,
-    order_selection,
-    two_sample_tests,
 )
 from neuroprior.behaviour.report.conditions import condition_section
 from neuroprior.behaviour.report.fits import ACTIONS, CONTEXT
 from neuroprior.behaviour.report.scores import Evaluation, evaluate_saved
 from neuroprior.behaviour.report.sections import (
     action_frame,
-    calibration_section,
     drift_section,
     file_section,
     lag_section,
-    likeness_section,
     motif_section,
-    order_section,
     score_section,
     transition_section,
 )
@@ -89,11 +84,11 @@ def test_what_is_in_the_file(plans, found):
 
 
 @pytest.mark.parametrize("section", [file_section, transition_section, condition_section])
-def test_all_plans_are_described_whichever_were_scored_and_sampled(section, plans, found):
+def test_all_plans_are_described_whichever_were_scored(section, plans, found):
     described = replace(plans, condition=GROUP % 2)
     parts = []
-    for scored, sampled in ((plans, plans), (plans[:4], plans[5:7])):
-        some = replace(found, plans=described, scored=scored, mask=scored.mask(), sampled=sampled)
+    for scored, first_fold in ((plans, plans), (plans[:4], plans[5:7])):
+        some = replace(found, plans=described, scored=scored, mask=scored.mask(), first_fold=first_fold)
         parts.append(section(some))
     first, second = parts
     assert [table.rows for table in first.section.tables] == [table.rows for table in second.section.tables]
@@ -149,32 +144,6 @@ def test_where_no_pair_of_actions_counts_there_is_no_section():
     assert lag_section(evaluation) is None
 
 
-def test_orders_are_those_of_half_the_median_plan_with_and_without_the_context(plans, found):
-    """The criteria are halved, in bits an action: at order 0 that is the entropy and half a parameter's price."""
-    frame = order_section(found).frames["orders"]
-    for inputs, contexts in ((ACTIONS, None), (CONTEXT, 2)):
-        own = frame[frame["context"] == inputs]
-        want = pd.DataFrame(order_selection(plans, 2, contexts))  # the median plan has five actions, the mean nearly 9
-        assert own["order"].tolist() == [0, 1, 2]
-        for name in want:
-            assert own[name].tolist() == want[name].tolist()
-        for price, name in ((math.log2(want["num_actions_scored"][0]) / 2, "bic_bits"), (1 / math.log(2), "aic_bits")):
-            bits = -want["log_likelihood"] / math.log(2) + want["num_parameters"] * price
-            assert own[name].tolist() == pytest.approx((bits / want["num_actions_scored"]).tolist())
-
-
-def test_calibration_is_that_of_the_models_with_the_best_input(found):
-    part = calibration_section(found)
-    frame = part.frames["calibration"]
-    assert found.best.inputs == CONTEXT
-    assert [*dict.fromkeys(zip(frame["model"], frame["context"], strict=True))] == [("one", CONTEXT), ("two", CONTEXT)]
-    assert frame.groupby("model")["number"].sum().tolist() == [3 * int(found.mask.sum())] * 2
-    for (name, error), (_, own) in zip(cells(part), frame.groupby("model"), strict=True):
-        gaps = (own["forecast"] - own["taken"]).abs() * own["number"]
-        assert name == f"{own['model'].iloc[0]}, with context"
-        assert float(error) == pytest.approx(100 * gaps.sum() / own["number"].sum(), abs=0.01)
-
-
 def test_transitions_are_counted_in_each_group(plans, found):
     """Pairs of all groups and of each, by hand; a probability is of those that follow the same action."""
     counts: dict[tuple[str, str, str], int] = {}
@@ -193,7 +162,7 @@ def test_transitions_are_counted_in_each_group(plans, found):
 
 @pytest.fixture(scope="module")
 def worded() -> Plans:
-    """Words with long runs, among noise."""
+    """Words among noise."""
     words = torch.tensor([[0, 0, 0, 1, 1, 2], [3, 3, 1, 1, 1, 0], [2, 2, 3, 0, 0, 3]])
     plans = words[torch.randint(3, (34, 4), generator=seeded(0))].flatten(1)
     wild = torch.rand(plans.shape, generator=seeded(1)) < 0.25
@@ -201,63 +170,16 @@ def worded() -> Plans:
     return Plans(actions, 4, action_names=list("abcd"), group=torch.arange(34) % 6)
 
 
-def test_sequences_with_repeats_kept_and_merged(worded):
+def test_over_represented_sequences(worded):
     part = motif_section(evaluate_saved({"uniform": UniformPrior(4)}, worded, 0))
-    frame = part.frames["motifs"]
-    for repeats, merged in (("kept", False), ("merged", True)):
-        every = motifs(worded, top=12, collapse_repeats=merged)
-        want = [one for one in every if one.corrected < 0.05]
-        assert len([one for one in every if one.p_value < 0.05]) > len(want) > 0
-        own = frame[frame["repeats"] == repeats]
-        assert own["sequence"].tolist() == [" ".join("abcd"[a] for a in one.actions) for one in want]
-        for name in ("count", "expected", "ratio", "low", "high", "p_value", "corrected"):
-            assert own[name].tolist() == [getattr(one, name) for one in want]
-        first = [own["sequence"].iloc[0], f"{own['count'].iloc[0]:,}", f"{own['expected'].iloc[0]:,.1f}"]
-        assert cells(part, merged)[0][:3] == first
-
-
-def generating(plans: Plans, found: Evaluation) -> Evaluation:
-    """The two models with a context have made up plans for eight of the plans; `two` is the better."""
-    sampled = plans[[11, 8, 6, 5, 4, 3, 1, 0]]
-    made = {"one": torch.zeros(8, 20, dtype=torch.long), "two": sampled.actions.roll(1, 0), "markov-1": sampled.actions}
-    models = [replace(model, generated=made.get(model.name)) for model in found.models]
-    return replace(found, models=models, sampled=sampled)
-
-
-@pytest.mark.parametrize("grouped", [True, False])
-def test_generated_plans_are_compared_with_those_in_whose_place_they_stand(plans, found, grouped):
-    """As long as these; the best model first; no test where plans of a group are alike."""
-    if not grouped:
-        plans = replace(plans, group=None, group_names=None)
-        found = replace(found, plans=plans, scored=plans)
-    evaluation = generating(plans, found)
-    part = likeness_section(evaluation)
-    frame, real = part.frames["likeness"], evaluation.sampled
-    order = sorted((m for m in evaluation.models if m.generated is not None), key=lambda model: model.cost)
-    assert frame["model"].unique().tolist() == [model.name for model in order]
-    for model in order:
-        alike = [Plans(some, 3, real.lengths) for some in (real.actions, model.generated)]
-        tests = two_sample_tests(*alike, generator=seeded(0))
-        own = frame[frame["model"] == model.name]
-        assert own["statistic"].tolist() == [one.statistic for one in tests]
-        for name in ("distance", "null_distance"):
-            assert own[name].tolist() == [getattr(one, name) for one in tests]
-        for name in ("p_value", "corrected"):
-            assert own[name].dropna().tolist() == ([] if grouped else [getattr(one, name) for one in tests])
-        (row,) = (row for row in cells(part) if row[0] == model.name)
-        stars = ["*" * (not grouped and one.corrected < 0.05) for one in tests]
-        assert row[2:] == [f"{one.distance:.3f}{star}" for one, star in zip(tests, stars, strict=True)]
-    best = two_sample_tests(
-        *[Plans(x, 3, real.lengths) for x in (real.actions, order[0].generated)], generator=seeded(0)
-    )
-    figures = {box.name: box for box in part.section.figures}
-    assert order[0].label in figures["raster"].caption
-    lengths = [one for one in best if one.statistic in ("run lengths", "return times")]
-    for axes, one in zip(figures["distributions"].figure.axes, lengths, strict=True):
-        drawn = {line.get_label(): line.get_ydata().tolist() for line in axes.lines}
-        assert drawn == {
-            name: values[values > 0].tolist() for name, values in (("real", one.real), ("generated", one.generated))
-        }
+    frame, every = part.frames["motifs"], motifs(worded, top=12)
+    want = [one for one in every if one.corrected < 0.05]
+    assert len([one for one in every if one.p_value < 0.05]) > len(want) > 0
+    assert frame["sequence"].tolist() == [" ".join("abcd"[a] for a in one.actions) for one in want]
+    for name in ("count", "expected", "ratio", "low", "high", "p_value", "corrected"):
+        assert frame[name].tolist() == [getattr(one, name) for one in want]
+    first = frame.iloc[0]
+    assert cells(part)[0][:3] == [first["sequence"], f"{first['count']:,}", f"{first['expected']:,.1f}"]
 
 
 def test_drift_within_plans_between_them_and_between_groups(plans, found):

@@ -10,66 +10,24 @@ import torch
 from matplotlib.figure import Figure
 
 from neuroprior.behaviour.report.document import Document
-from neuroprior.behaviour.report.fits import counted
+from neuroprior.behaviour.report.options import FitOptions, ReadOptions
 from neuroprior.behaviour.report.page import FigureBox
 from neuroprior.behaviour.report.plan_report import report
 from neuroprior.behaviour.report.scores import evaluate_saved
 from neuroprior.behaviour.report.sections import (
     SECTIONS,
-    action_frame,
     drift_section,
     lag_section,
-    macro_section,
-    motif_section,
-    order_section,
 )
 from neuroprior.plans import Plans
-from neuroprior.priors import MarkovPrior, UniformPrior, learn_macros
+from neuroprior.priors import UniformPrior
 from tests.support.chains import markov_plans, markov_probs
-from tests.support.reports import QUICK
+from tests.support.reports import QUICK_IN_TWO
 from tests.support.sources import refuses, seeded
 
 
 def found_in(plans: Plans):
     return evaluate_saved({"uniform": UniformPrior(plans.num_actions)}, plans, 0)
-
-
-def test_macro_actions_have_the_bits_that_they_save():
-    """The table holds what `learn_macros` found, in names, and adds up."""
-    words = torch.tensor([[0, 1, 2, 0], [3, 2, 2, 1]])
-    plans = Plans(words[torch.randint(2, (300, 5), generator=seeded(0))].flatten(1), 4, action_names=list("abcd"))
-    section, frames = macro_section(found_in(plans))
-    rows = frames["macros"]
-    assert {"a b c a", "d c c b"} <= set(rows["macro"])
-    macros, recoded = learn_macros(plans, 16, "compression")
-    assert rows["count"].tolist() == [macro.count for macro in macros]
-    assert (rows["gain_bits"] > 0).all()
-    # Bits before and after, counted anew: after, the definitions, two of log2(kinds) each, come on top.
-    bits = []
-    for symbols in (plans.actions, recoded.actions[recoded.mask()]):
-        counts = symbols.flatten().long().bincount()
-        share = counts[counts > 0] / counts.sum()
-        bits.append(float(-(counts[counts > 0] * share.log2()).sum()))
-    bits[1] += sum(2 * torch.tensor(4.0 + k).log2().item() for k in range(len(macros)))
-    shown = section.tables[0].rows
-    for row, value in ((shown[0], bits[0]), (shown[-1], bits[1])):
-        assert row[-1] == f"{value / plans.actions.numel():.3f}"
-    assert rows["bits_per_action"].iloc[-1] == pytest.approx(bits[1] / plans.actions.numel(), rel=1e-4)
-    assert bits[0] - bits[1] == pytest.approx(sum(macro.gain for macro in macros), rel=1e-4)
-
-
-def test_where_nothing_repeats_there_is_no_section():
-    plans = Plans(torch.randint(20, (10, 4), generator=seeded(0)), 20)
-    assert macro_section(found_in(plans)) is None
-
-
-@pytest.mark.parametrize(("often", "beyond", "repeats"), [(4, 0, {"kept"}), (2, 1, {"kept", "merged"})])
-def test_repeats_are_of_actions_that_were_taken(often, beyond, repeats):
-    """Every so-many-th word has a repeat: 18 or 21 % of all pairs; what stands beyond the ends is none of them."""
-    word = (torch.arange(800).view(400, 2) * 7 // 3 % often == 0).long()
-    actions = torch.tensor([[0, 1, 2, 0], [3, 2, 2, 0]])[word].flatten(1)
-    plans = Plans(torch.nn.functional.pad(actions, (0, 3), value=beyond), 4, torch.full((400,), 8))
-    assert set(motif_section(found_in(plans)).frames["motifs"]["repeats"]) == repeats
 
 
 def test_gains_are_starred_where_their_interval_is_above_0():
@@ -84,24 +42,6 @@ def test_gains_are_starred_where_their_interval_is_above_0():
     shown = {row[0]: row[place] for row in table.rows if row[place]}
     want = {"1": "0.3000*", "2": "0.3000", "3": "0.3000", "4": "0.0000", "6": "0.2000*"}
     assert {lag: cell.strip() for lag, cell in shown.items()} == want
-
-
-def test_the_least_of_each_input_is_starred():
-    plans = markov_plans(markov_probs(3, 2, 0, 1.5), 40, 12, 1, context=torch.arange(40) % 2)
-    chains = {f"markov-{k}": MarkovPrior(3, k).fit(replace(plans, context=None)) for k in (0, 2)}
-    part = order_section(evaluate_saved(chains, plans, 0))
-    (table,), frame = part.section.tables, part.frames["orders"]
-    bits = {name: -float(prior.log_prob(plans.actions).sum()) / math.log(2) / 480 for name, prior in chains.items()}
-    want = []
-    for row in frame.itertuples():
-        own = frame[frame["context"] == row.context]
-        cells = [f"{row.bic_bits:.4f}" + "*" * bool(row.bic_bits == own["bic_bits"].min())]
-        cells.append(f"{row.aic_bits:.4f}" + "*" * bool(row.aic_bits == own["aic_bits"].min()))
-        held = bits.get(f"markov-{row.order}") if row.context == "actions" else None
-        cells.append("" if held is None else f"{held:.4f}" + "*" * (held == min(bits.values())))
-        want.append([str(row.order), row.context.replace(" and ", ", "), f"{row.num_parameters:,}", *cells])
-    assert [[cell.strip() for cell in row] for row in table.rows] == want
-    assert sum(row[3].endswith("*") for row in want) == 2
 
 
 def test_actions_whose_share_changes_most_come_first():
@@ -128,7 +68,7 @@ def test_actions_whose_share_changes_most_come_first():
         assert row.change == pytest.approx(own[1] - own[0])
 
 
-ASKED: dict[str, Any] = {"folds": 2, "skip": 1, "seed": 5} | QUICK
+ASKED: dict[str, Any] = {"skip": 1, "fits": replace(QUICK_IN_TWO, seed=5)}
 
 
 @pytest.fixture(scope="module")
@@ -138,42 +78,21 @@ def made() -> Document:
 
 
 def test_a_report_has_its_tables_and_figures(made):
-    assert {*made.tables, "motifs", "macros"} == {
-        *("plans", "actions", "lags", "orders", "calibration", "transitions", "transition_test"),
-        *("motifs", "macros"),
-        *("likeness", "drift", "drift_tests", "action_drift"),
+    assert {*made.tables, "motifs"} == {
+        *("plans", "actions", "lags", "transitions", "transition_test"),
+        *("motifs", "drift", "drift_tests", "action_drift"),
     }
     assert all(isinstance(frame, pd.DataFrame) for frame in made.tables.values())
-    names = {"scores", "lags", "orders", "calibration", "transitions", "group_transitions", "raster", "distributions"}
-    assert {*names, "drift"} <= set(made.figures)
+    assert {"scores", "lags", "transitions", "group_transitions", "drift"} <= set(made.figures)
     assert all(isinstance(figure, Figure) for figure in made.figures.values())
     boxes = [box for section in made.sections for box in section.figures]
     assert all(isinstance(box, FigureBox) and box.caption and box.alt and box.name for box in boxes)
-    assert len(made.sections) >= len(SECTIONS) - 3  # of macro-actions, motifs and conditions there may be none
+    assert len(made.sections) >= len(SECTIONS) - 4  # motifs, conditions, durations and modes
 
 
 def test_what_is_asked_for_is_done(made):
-    asked = {name: value for name, value in ASKED.items() if name not in ("models", "processes")}
+    asked = {"folds": 2, "skip": 1, "seed": 5, "max_steps": 3}
     assert made.settings | asked == made.settings
-
-
-def test_actions_are_counted_by_plan():
-    plans = Plans(torch.tensor([[2, 2, 1], [2, 0, 0]]), 3, durations=torch.tensor([[1.0, 5, 2], [3, 4, 8]]))
-    frame = action_frame(plans)
-    assert frame[["action", "count", "plans", "median_duration"]].to_numpy().tolist() == [
-        ["2", 3, 2, 3.0],
-        ["0", 2, 1, 6.0],
-        ["1", 1, 1, 2.0],
-    ]
-    assert frame["share"].tolist() == pytest.approx([1 / 2, 1 / 3, 1 / 6])  # of all actions
-
-
-def test_bits_are_shown_as_nats_and_perplexities_too(made):
-    table = made.tables["plans"]
-    for bits, end in (("bits_per_action", ""), ("low", "_low"), ("high", "_high")):
-        assert table["nats" + (end or "_per_action")].tolist() == pytest.approx((table[bits] * math.log(2)).tolist())
-        assert table[f"perplexity{end}"].tolist() == pytest.approx((2 ** table[bits]).tolist())
-    assert table["perplexity"][0] == pytest.approx(3)  # of the uniform prior
 
 
 def test_the_lead_names_the_best_model(made):
@@ -195,33 +114,29 @@ def test_plans_in_memory_and_in_a_file_have_the_same_report(tmp_path, made):
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.html", "results.json", "plans.csv", "folds"}
 
 
-@pytest.mark.parametrize("skip", [0, 3])
-def test_priors_by_name_are_scored(skip):
-    plans = markov_plans(markov_probs(3, 1, 0, 1.5), 24, 8, 1)
-    chain = MarkovPrior(3, 1).fit(plans)
-    made = report(plans, priors={"mine": chain, "none": UniformPrior(3)}, skip=skip, sections=["scores"])
-    scores = made.tables["plans"]
-    assert scores["model"].tolist() == ["mine", "none"]
-    bits = -chain.action_log_probs(plans)[:, skip:].sum() / torch.tensor(2.0).log() / counted(plans, skip).sum()
-    assert scores["bits_per_action"][0] == pytest.approx(float(bits), abs=1e-5)
+PLANS = markov_plans(markov_probs(3, 1, 0), 8, 5, 1)
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "fits", "words"),
     [
-        ({"models": []}, ("models", "none")),
-        ({"inputs": ["nodes"]}, ("inputs", "nodes")),
-        ({"inputs": ["context"]}, ("inputs", "no context")),
-        ({"sections": ["weather"]}, ("sections", "weather")),
-        ({"num_actions": 3}, ("num_actions", "files")),
-        ({"priors": {}}, ("priors", "at least one")),
-        ({"priors": {"a": UniformPrior(3)}, "folds": 2}, ("priors", "folds")),
-        ({"test": markov_plans(markov_probs(3, 1, 0), 4, 5, 1), "folds": 2}, ("folds", "test")),
+        ({}, {"models": []}, "`models` must be a list of some of counts"),
+        ({}, {"inputs": ["nodes"]}, "`inputs` must be a list of some of"),
+        ({}, {"inputs": ["context"]}, "`inputs` must hold more"),
+        ({}, {"effort": "quick"}, "effort"),
+        ({}, {"effort": "full", "models": ["gru"]}, "`effort` must be left out"),
+        ({}, {"seed": 2**50}, "`seed` must be from 0 to 1125899906842623"),
+        ({"sections": ["weather"]}, {}, "`sections` must be a list of some of file"),
+        ({"reading": ReadOptions()}, {}, "`reading` must be left out"),
+        ({"priors": {}}, {}, "`priors` must be a dict"),
+        ({"priors": {"a": UniformPrior(3)}}, {"folds": 2}, "`folds` must be left out"),
+        ({"priors": {"a": UniformPrior(3)}, "test": PLANS}, {}, "`test` must be left out"),
+        ({"test": PLANS}, {"folds": 2}, "`folds` must be left out"),
     ],
 )
-def test_what_cannot_be_reported_is_refused(options, words):
-    with refuses(*words):
-        report(markov_plans(markov_probs(3, 1, 0), 8, 5, 1), **options)
+def test_what_cannot_be_reported_is_refused(options, fits, words):
+    with refuses(words):
+        report(PLANS, fits=FitOptions(**fits), **options)
 
 
 def verdicts(document: Document) -> str:
@@ -251,16 +166,15 @@ def animals(number: int, sessions: int = 8) -> Plans:
 @pytest.mark.parametrize(("number", "enough"), [pytest.param(3, False, marks=pytest.mark.slow), (4, False), (5, True)])
 def test_few_groups_bear_no_verdict(number, enough):
     """Below five animals nothing is starred, ringed, dotted or called best; the numbers stand."""
-    whole = report(animals(number), folds=2, **QUICK)
+    whole = report(animals(number), fits=QUICK_IN_TWO)
     said, few = verdicts(whole), f"{number} groups are too few for a verdict"
     assert (few in whole.lead) != enough
     assert ("The best model" in whole.lead) == enough
     assert ("*" in said) == enough
     assert ("significant" in said) == enough
     assert ("p" in said.split("\n")) == enough  # the heading of a column
-    assert (marks(whole.figures["orders"]) > 0) == enough
     assert (marks(whole.figures["group_transitions"]) > 0) == enough
-    assert said.count(few) == (0 if enough else 7)  # the lead, and each section that would draw one
+    assert said.count(few) == (0 if enough else 6)  # the lead, and each section that would draw one
     assert whole.tables["plans"]["low"].notna().all()
     assert "over groups" in whole.lead
 
@@ -268,26 +182,29 @@ def test_few_groups_bear_no_verdict(number, enough):
 def test_parts_of_a_plan_are_not_plans():
     """A single long session is one: its parts have intervals, and bear no verdict."""
     (plan,) = markov_plans(markov_probs(3, 1, 0, 1.5), 1, 400, 1).actions
-    found = report(Plans(plan[None], 3), folds=2, **QUICK)
+    found = report(Plans(plan[None], 3), fits=QUICK_IN_TWO)
     assert "over parts of the plan" in found.lead
     assert "1 plan is too few for a verdict" in found.lead
     assert "*" not in verdicts(found)
 
 
-@pytest.mark.parametrize("names", [None, ["run", "rest", "hide", "dig", "eat", "drink"]])
-def test_actions_that_never_occur_count_in_uniform_and_the_report_says_so(names):
+@pytest.mark.parametrize(
+    ("names", "listed"),
+    [
+        (None, "0, 2, 4, 5 never occur"),
+        (["run", "rest", "hide", "dig", "eat", "drink"], "Run, hide, eat, drink never occur"),
+        (["rest", "dig"], ""),
+    ],
+)
+def test_actions_that_never_occur_count_in_uniform_and_the_report_says_so(names, listed):
     """Bits of uniform are those of all names: the tables say which never occur, and what the others alone take."""
-    actions = torch.randint(2, (30, 8), generator=seeded(0)) * 2 + 1
-    plans = Plans(actions, 6, action_names=names)
-    made = report(plans, **QUICK, sections=["file", "scores"], folds=2)
-    assert made.frames["plans"].set_index("model")["bits_per_action"]["uniform"] == pytest.approx(math.log2(6))
-    listed = "0, 2, 4, 5 never occur" if names is None else "Run, hide, eat, drink never occur"
-    first, scores = (next(s for s in made.sections if s.title == title) for title in ("Plans", "Held-out scores"))
-    assert listed in first.tables[1].caption
-    assert f"of which {listed[:1].lower()}{listed[1:]}; without them it needs 1.0000 bits" in scores.tables[0].caption
-
-
-def test_where_all_actions_occur_nothing_is_said_of_those_that_never_do():
-    plans = Plans(torch.randint(2, (30, 8), generator=seeded(0)), 2)
-    whole = report(plans, **QUICK, sections=["file", "scores"], folds=2)
-    assert not any("never" in table.caption for section in whole.sections for table in section.tables)
+    actions, number = torch.randint(2, (30, 8), generator=seeded(0)), 6 if names is None else len(names)
+    plans = Plans(actions * 2 + 1 if number == 6 else actions, number, action_names=names)
+    made = report(plans, fits=QUICK_IN_TWO, sections=["file", "scores"])
+    assert made.frames["plans"].set_index("model")["bits_per_action"]["uniform"] == pytest.approx(math.log2(number))
+    captions = [table.caption for section in made.sections for table in section.tables]
+    assert sum("never" in caption for caption in captions) == 2 * bool(listed)
+    if listed:
+        assert listed in captions[1]
+        small = f"{listed[:1].lower()}{listed[1:]}"
+        assert f"of which {small}; without them it needs 1.0000 bits" in captions[2]

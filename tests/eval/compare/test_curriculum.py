@@ -117,7 +117,7 @@ def test_the_context_is_in_the_tables_and_the_figure():
 
 
 def test_nothing_to_draw():
-    with refuses("views: at least one"):
+    with refuses("`views` must not be empty"):
         score_panels([])
 
 

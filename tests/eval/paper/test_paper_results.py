@@ -30,6 +30,12 @@ def test_with_several_worlds_priors_learn_in_others(worlds, monkeypatch):
         first_simulation.simulate(replace(settings(), worlds=worlds), neural=False)
 
 
+def test_ties_count_for_each():
+    scores = torch.tensor([[1.0, 2.0, 3.0], [1.0, 1.0, 5.0], [0.0, 2.0, 9.0]])
+    best = first_simulation.best_of(scores, scores[:2])
+    assert best.tolist() == [[True, True, False], [True, False, True], [False, True, True]]
+
+
 def test_the_distance_from_the_papers_table():
     """The root mean square; of a single value function its interval is the distance itself."""
     t = settings()

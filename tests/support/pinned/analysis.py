@@ -9,7 +9,6 @@ from neuroprior.behaviour import (
     action_bits,
     action_drift,
     baselines,
-    bits_by_position,
     by_group,
     by_plan,
     by_position,
@@ -17,14 +16,11 @@ from neuroprior.behaviour import (
     mode_frame,
     mode_plans,
     mode_table,
-    mode_transitions,
-    pieces,
-    reliability,
     score,
     score_bits,
-    two_sample_tests,
-    units,
 )
+from neuroprior.behaviour.analysis.lags import pieces
+from neuroprior.behaviour.analysis.modes import mode_transitions
 from neuroprior.priors import ContextTreePrior, MarkovPrior, SwitchingPrior, UniformPrior, forecast, infer
 from neuroprior.priors.scoring import score as score_table
 from neuroprior.worlds import cube, gridworld
@@ -35,9 +31,9 @@ from tests.support.unchanged import case
 
 @case
 def comparisons():
-    """Priors on held-out plans: bits, differences, calibration, drift, what is generated."""
+    """Priors on held-out plans: bits, differences, drift."""
     learned, held_out = behaviour(40), behaviour(24, seed=7)
-    chain, tree, nothing = MarkovPrior(3, 1).fit(learned), ContextTreePrior(3, 4).fit(learned), UniformPrior(3)
+    chain, tree = MarkovPrior(3, 1).fit(learned), ContextTreePrior(3, 4).fit(learned)
     scores = [score(name, prior, held_out) for name, prior in {"chain": chain, "tree": tree}.items()]
     bits, mask = action_bits(chain, held_out), held_out.mask()
     found: dict[str, Any] = {
@@ -45,7 +41,7 @@ def comparisons():
         "bits": [one.bits_per_action() for one in scores],
         "difference": scores[0].minus(scores[1]),
         "of some": score_bits("some", "actions", bits, held_out, mask & (torch.arange(14) > 1)).bits_per_action(),
-        "positions": [one.bits_per_action() for one in bits_by_position(tree, pieces(held_out, 4, 40, seeded(0)))],
+        "pieces": pieces(held_out, 4, 40, seeded(0)).actions,
         "baselines": [[one.model, one.how, one.validation_bits] for one in baselines(learned, held_out)],
         "drift by group": by_group(held_out, bits, mask),
         "drift by plan": by_plan(held_out, bits, mask),
@@ -62,16 +58,6 @@ def comparisons():
     found["baselines with context"] = [
         [one.model, one.how, one.validation_bits] for one in baselines(context, behaviour(9, context="step", seed=2), 3)
     ]
-    forecasts = torch.cat([chain(part.actions).log_softmax(-1)[part.mask()] for part in [held_out]])
-    unit = units(held_out, mask)[mask]
-    curve = reliability(forecasts, held_out.actions[mask].long(), unit, 4)
-    found["reliability"] = [curve.bins, curve.expected_calibration_error]
-    generated = chain.sample(24, 14, generator=seeded(3))
-    plans = type(held_out)(generated, 3, held_out.lengths)
-    found["likeness"] = two_sample_tests(held_out, plans, 99, seeded(0))
-    found["likeness without groups"] = two_sample_tests(
-        plans, type(plans)(nothing.sample(30, 9, generator=seeded(1)), 3), 99, seeded(0)
-    )
     for by in ("plan", "group", "condition", "action"):
         found[f"by {by}"] = score_table(MarkovPrior(3, 1).fit(timed()), timed(9, seed=4), by)
     return found
