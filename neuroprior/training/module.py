@@ -54,14 +54,13 @@ class PriorModule(lightning.LightningModule):
 
     def on_validation_epoch_start(self) -> None:
         self.prior.eval()
-        self._hidden, self._held_out = None, torch.zeros(2, dtype=torch.double)
+        self._held_out = torch.zeros(2, dtype=torch.double)
 
     def validation_step(self, batch: Batch, batch_index: int) -> None:
         total, weight, self._hidden = bits(self.prior, batch, self._hidden)
         self._held_out += torch.stack([total, weight]).cpu()  # not every device has float64
 
     def on_validation_epoch_end(self) -> None:
-        self._hidden = None
         held_out = float(self._held_out[0] / self._held_out[1].clamp(min=1))
         trained = float(self._totals[0] / self._totals[1].clamp(min=1))
         rate = self.trainer.optimizers[0].param_groups[0]["lr"]

@@ -22,11 +22,10 @@ from neuroprior.cli.program import Command, run_commands, run_program
     ("error", "code", "line"),
     [
         (ValueError("what\n  was"), 2, "error: what was"),
+        (ValueError("words " * 1000), 2, "error: " + "words " * 165 + "..."),
         (FileNotFoundError(2, "No such file", "x"), 2, "error: x: no such file"),
         (OSError("disk"), 2, "error: disk"),
-        (ImportError("no module"), 2, "error: no module"),
         (MemoryError("too much"), 2, "error: too much"),
-        (OverflowError("too large"), 2, "error: too large"),
         (KeyboardInterrupt("go on"), 130, "go on"),
         (KeyboardInterrupt(), 130, "interrupted; what was not yet written is lost"),
         (RuntimeError("no memory\nfor it"), 2, "error: out of memory; a smaller run may fit (no memory)"),
@@ -124,9 +123,7 @@ def test_help_lists_commands_and_options(capsys):
     assert "In which worlds, one after another." in out
 
 
-@pytest.mark.parametrize(
-    ("module", "after"), [("neuroprior", 0.15), ("neuroprior", 0.6), ("eval", 0.3), ("train", 0.5)]
-)
+@pytest.mark.parametrize(("module", "after"), [("neuroprior", 0.15), ("eval", 0.3), ("train", 0.5)])
 def test_ctrl_c_while_libraries_load(module, after):
     """It takes about two seconds until a command runs: no traceback before that either."""
     arguments = {"eval": ["plans", "none.csv"]}.get(module, ["fit", "--config", "none"])

@@ -12,6 +12,7 @@ import torch
 from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, StackedPrior, TransformerPrior, load
 from neuroprior.__main__ import main
 from neuroprior.behaviour import Baseline
+from neuroprior.cli.fit_data import divide
 from neuroprior.plans import read_plans, write_minari, write_plans
 from neuroprior.priors.scoring import learned_from
 from neuroprior.training import Settings
@@ -210,6 +211,18 @@ def test_settings_reach_the_networks_inside_other_priors(name, plans_file, tmp_p
         first, second = (replace(how, validation=0.2) for how in (first, second))
     assert first == second == Settings(**asked, progress=False)
     assert seed != other
+
+
+def test_a_network_is_stopped_by_the_validation_plans(plans_file, tmp_path, monkeypatch):
+    given = []
+    monkeypatch.setattr("neuroprior.cli.fit.train", lambda *arguments: given.extend(arguments) or [])
+    quick = ["--config", "gru", "--max_steps", "7", "--seed", "3", "--out", str(tmp_path / "run")]
+    assert main(["fit", plans_file, *quick]) == 0
+    _, plans, how, seed, folder = given
+    parts = divide(some_plans(60), seed=3)
+    assert plans.actions.equal(parts.learned_from.actions)
+    assert how.validation.actions.equal(parts.chosen_on.actions)
+    assert (replace(how, validation=0.1), seed, folder) == (Settings(7), 3, tmp_path / "run")
 
 
 def test_what_is_not_set_is_left_to_the_prior_and_folds_are_silent(plans_file, tmp_path, monkeypatch):
