@@ -170,9 +170,9 @@ def fit(
     ended = source.with_end() if end and source.end is None else source
     parts = divide(ended, validation, held_out, folds, past_durations, seed)
     training = replace(training, validation=validation)
-    own: dict[str, Any] = {} if effort is None else {"effort": effort}
+    arguments: dict[str, Any] = {} if effort is None else {"effort": effort}
     try:
-        made = make_prior(parts.plans, partial(prior, **own), use_context)
+        made = make_prior(parts.plans, partial(prior, **arguments), use_context)
     except TypeError as error:
         raise ValueError(
             f"`prior` must take what it is given: {error}; --use_context false leaves the context out."
@@ -195,9 +195,8 @@ def fit(
     for note in source.notes:
         print(f"note: {note}")
     # Defaults are left to the prior, as in `neuroprior.fit`: those of the networks inside it may be others.
-    default = vars(DEFAULTS)
-    settings = {name: value for name, value in vars(training).items() if value != default[name]}
-    settings = {name: settings[name] for name in made.fit_settings if name in settings}
+    changed = {name: value for name, value in vars(training).items() if value != getattr(DEFAULTS, name)}
+    settings = {name: changed[name] for name in made.fit_settings if name in changed}
     curve: list[dict[str, float]] = []
     try:
         if isinstance(made, NeuralPrior):

@@ -60,7 +60,11 @@ def divide(
     Raises:
         ValueError: too few plans, or an argument out of range.
     """
-    for name, value in (("validation", validation), ("held_out", held_out), ("both", validation + held_out)):
+    for name, value in (
+        ("validation", validation),
+        ("held_out", held_out),
+        ("validation + held_out", validation + held_out),
+    ):
         if not 0 < value < 1:
             raise ValueError(f"`{name}` must be above 0 and below 1, got {value}.")
     if past_durations < 0:

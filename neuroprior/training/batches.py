@@ -31,7 +31,7 @@ class Batch(NamedTuple):
     Attributes:
         actions: `[N, T]`; vectors `[N, T, D]`.
         weight: `[N, T]`, of each action in the loss; 0 beyond a plan's end.
-        context: `[N]`, `[N, C]`, `[N, T]`, `[N, T, C]` or None.
+        context: `[N, T]`, `[N, T, C]` or None.
         previous: `[N]` or `[N, D]`, the action before the window, `num_actions` or NaN for none; None where all are
             whole plans.
         continues: whether the rows continue those of the batch before, so that the hidden state is carried over.
