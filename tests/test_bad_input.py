@@ -161,8 +161,8 @@ def test_numbers_of_numpy_are_numbers():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["report", "FILE", "--columns.acton", "x"], ["columns", "no option 'acton'"]),
-        (["fit", "--config", "markov", "--data.file", "FILE", "--model.prior.hidden", "8"], ["prior", "'hidden'"]),
+        (["report", "FILE", "--columns.acton", "x"], ["columns", "'acton'"]),
+        (["fit", "FILE", "--config", "markov", "--prior.hidden", "8"], ["prior", "'hidden'"]),
         (["sample", "PRIOR", "--seed", str(2**70)], ["seed", "2**63"]),
         (["score", "PRIOR", "FILE", "--out", "OUT"], ["at least two held-out actions"]),
     ],
@@ -175,5 +175,5 @@ def test_options_that_cannot_be(arguments, words, tmp_path, capsys):
     out, said = capsys.readouterr()
     assert not out
     assert said.startswith("error: ")
-    assert len(said) < 200
+    assert len(said) < 500
     assert all(word in said for word in words), said

@@ -1,23 +1,8 @@
-"""Entry point: `python -m train fit`."""
+"""Entry point: `python -m train fit`, which is `neuroprior fit`."""
 
 import sys
-from collections.abc import Sequence
 
-from neuroprior._interrupts import ending_at_interrupts
-
-with ending_at_interrupts():
-    from neuroprior.__main__ import COMMANDS
-    from neuroprior.cli.program import run_program
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program; see `run_program`."""
-    return run_program(_run, arguments)
-
-
-def _run(arguments: Sequence[str]) -> None:
-    COMMANDS["fit"].load()(list(arguments), "python -m train")
-
+from neuroprior.__main__ import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -185,7 +185,7 @@ def load_for(folder: str, world: str, num_actions: int, action_names: Sequence[s
     """
     prior = load(folder)
     if prior.end is not None:
-        raise ValueError(f"{folder}: samples an end symbol, which is no action of a world; train without --data.end")
+        raise ValueError(f"{folder}: samples an end symbol, which is no action of a world; train without --end")
     if prior.num_actions != num_actions:
         raise ValueError(
             f"{folder}: {num_actions} actions, those of the world {world}, are expected, not {prior.num_actions}"

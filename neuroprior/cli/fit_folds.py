@@ -13,7 +13,7 @@ from neuroprior._jobs import JobRun
 from neuroprior.behaviour.analysis.comparison import Score, action_bits, baselines, score_bits
 from neuroprior.behaviour.report.fits import ACTIONS, CONTEXT, Arrays
 from neuroprior.behaviour.report.scores import load_arrays, save_arrays
-from neuroprior.cli.fit_recipe import PlansData
+from neuroprior.cli.fit_data import Parts
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import divisible, fair_split, folds
 from neuroprior.plans.sequences import plans_digest
@@ -24,7 +24,7 @@ TRAINED = "trained"
 
 
 def cross_validated(
-    folder: Path, prior: Prior, settings: Mapping[str, Any], data: PlansData, num_contexts: int | None
+    folder: Path, prior: Prior, settings: Mapping[str, Any], data: Parts, num_contexts: int | None
 ) -> dict[str, Score]:
     """Score a prior and the baselines on all plans, each fold under a fit without it.
 
@@ -42,11 +42,9 @@ def cross_validated(
         ValueError: plans of a fold that cannot be learned from.
         KeyboardInterrupt: finished folds are kept.
     """
-    share = data.given.validation
-    assert isinstance(share, float)
-    fit = partial(_fit_and_score, prior, dict(settings), data.plans, data.folds, data.seed, share, num_contexts)
+    fit = partial(_fit_and_score, prior, dict(settings), data, num_contexts)
     asked = {"plans": plans_digest(data.plans), "prior": repr(prior), "settings": dict(settings), "seed": data.seed}
-    asked |= {"folds": data.folds, "validation": share, "num_contexts": num_contexts}
+    asked |= {"folds": data.folds, "validation": data.validation, "num_contexts": num_contexts}
     run = JobRun(fit, folder / "folds", asked, name="fold{}".format, save=save_arrays, load=load_arrays, suffix=".npz")
     # Counting takes less time than starting processes; and these cannot share a GPU's memory.
     alone = not prior.fit_settings or prior.device.type != "cpu"
@@ -63,23 +61,14 @@ def cross_validated(
     return scores
 
 
-def _fit_and_score(
-    fresh: Prior,
-    settings: dict[str, Any],
-    plans: Plans,
-    number: int,
-    seed: int,
-    validation: float,
-    num_contexts: int | None,
-    fold: int,
-) -> Arrays:
+def _fit_and_score(fresh: Prior, settings: dict[str, Any], data: Parts, num_contexts: int | None, fold: int) -> Arrays:
     """The bits of the held-out actions under each model, and whether it takes the context, by its name."""
-    training, index = folds(plans, number, seed)[fold]
-    learned, held_out = divisible(plans[training]), plans[index]
-    generator = torch.Generator().manual_seed(seed * 1000 + fold)
+    training, index = folds(data.plans, data.folds, data.seed)[fold]
+    learned, held_out = divisible(data.plans[training]), data.plans[index]
+    generator = torch.Generator().manual_seed(data.seed * 1000 + fold)
     prior = deepcopy(fresh).fit(learned, generator=generator, **settings)
     found = _arrays(TRAINED, prior, held_out)
-    for baseline in baselines(*fair_split(learned, validation, generator), num_contexts):
+    for baseline in baselines(*fair_split(learned, data.validation, generator), num_contexts):
         if baseline.prior is not None:
             # Its settings were chosen on the validation plans; then these are learned from as well.
             found |= _arrays(baseline.model, baseline.prior.fit(learned), held_out)

@@ -12,15 +12,20 @@ from rich.console import Console
 from neuroprior._files import versions, write_json
 from neuroprior.behaviour.analysis.comparison import Score, baselines, never_taken, score, too_few, unit_name
 from neuroprior.behaviour.report.document import printed, records, table, write_figures, write_frames
+from neuroprior.cli.fit_data import Parts
 from neuroprior.cli.fit_folds import TRAINED, cross_validated
-from neuroprior.cli.fit_recipe import PlansData, PriorModel
 from neuroprior.priors import CombinedPrior, Prior, save
 from neuroprior.priors.fitting import name_of
 from neuroprior.priors.scoring import keep_learned
 
 
 def report(
-    folder: Path, model: PriorModel, data: PlansData, fresh: Prior | None = None, settings: Mapping[str, Any] = {}
+    folder: Path,
+    prior: Prior,
+    curve: list[dict[str, float]],
+    data: Parts,
+    fresh: Prior,
+    settings: Mapping[str, Any],
 ) -> None:
     """Save the prior, compare it with baselines, and print the table.
 
@@ -28,32 +33,33 @@ def report(
 
     Args:
         folder: of the run.
-        model: trained.
+        prior: trained.
+        curve: of its training; empty where it was not trained step by step.
         data: the plans.
         fresh: the prior before training, for a cross-validation.
         settings: of its `fit` there.
     """
     console = Console()
-    prior, name = model.prior.cpu().eval(), name_of(model.prior)
+    prior, name = prior.cpu().eval(), name_of(prior)
     save(prior, folder)
-    held_out = data.held_out if data.folds == 1 else None
-    keep_learned(folder, data.learned_from, data.chosen_on, held_out=held_out, plans=data.plans)
+    many = data.folds > 1
+    keep_learned(folder, data.learned_from, data.chosen_on, held_out=None if many else data.held_out, plans=data.plans)
     contexts = data.num_contexts if prior.takes_context else None
     scores: dict[str, Score] = {}
-    if fresh is not None:
+    if many:
         console.print(
             f"cross-validation: {name} and the baselines are fitted {data.folds} times more, each time without some of"
-            f" the {unit_name(data.plans)}; with --data.folds 1 a share of them is held out instead",
+            f" the {unit_name(data.plans)}; with --folds 1 a share of them is held out instead",
             highlight=False,
         )
         scores = cross_validated(folder, fresh, settings, data, contexts)
-    trained = replace(scores.pop(TRAINED), model=name) if fresh else score(name, prior, data.held_out)
+    trained = replace(scores.pop(TRAINED), model=name) if many else score(name, prior, data.held_out)
     rows = []
     with console.status("fitting baselines") as status:
         show = lambda what: status.update(f"fitting {what}")  # noqa: E731
         for baseline in baselines(data.learned_from, data.chosen_on, contexts, show):
             # There is no prior where its tables would be too large.
-            if fresh is None and baseline.prior is not None:
+            if not many and baseline.prior is not None:
                 scores[baseline.model] = score(baseline.model, baseline.prior, data.held_out)
             one = scores.get(baseline.model)
             row = _row(one, trained) if one else {"model": baseline.model}
@@ -64,13 +70,12 @@ def report(
     best = frame.iloc[int(frame.validation_bits.astype(float).argmin())]
     console.print(_table(frame, best.model, data))
     parts = {"training": data.learned_from, "validation": data.chosen_on, "held_out": data.held_out}
-    written = frame.assign(sees=frame.context)  # its former name
-    results = {"rows": records(written), "chosen": best.model, "unit": unit_name(data.held_out), "folds": data.folds}
-    results |= {"plans": {part: len(plans) for part, plans in parts.items()}, "curve": model.curve}
+    results = {"rows": records(frame), "chosen": best.model, "unit": unit_name(data.held_out), "folds": data.folds}
+    results |= {"plans": {part: len(plans) for part, plans in parts.items()}, "curve": curve}
     write_json(folder / "metrics.json", results | {"versions": versions()})
-    write_frames(folder, {"metrics": written})
-    if model.curve:
-        figure = learning_curve(name, pd.DataFrame(model.curve), best.model, best.validation_bits)
+    write_frames(folder, {"metrics": frame})
+    if curve:
+        figure = learning_curve(name, pd.DataFrame(curve), best.model, best.validation_bits)
         write_figures(folder, {"learning_curve": figure})
     console.print(f"saved in {folder}; in Python: neuroprior.load({str(folder)!r})", highlight=False, soft_wrap=True)
 
@@ -100,7 +105,7 @@ def _row(one: Score, trained: Score) -> dict[str, Any]:
     return row | {"p_value": gap.p_value}
 
 
-def _table(frame: pd.DataFrame, chosen: str, data: PlansData) -> Any:
+def _table(frame: pd.DataFrame, chosen: str, data: Parts) -> Any:
     """The table for the terminal; the best baseline is marked."""
     actions, unit = int(data.held_out.mask().sum()), unit_name(data.held_out)
     trained, few = frame.index[-1], too_few(data.held_out)

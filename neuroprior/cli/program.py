@@ -1,31 +1,21 @@
 """What the programs share: commands from functions, one line for bad input (exit code 2), one for Ctrl-C (130)."""
 
 import inspect
-import re
 import signal
 import sys
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from argparse import ArgumentError
+from collections.abc import Callable, Collection, Mapping, Sequence
 from importlib import import_module
+from textwrap import shorten
 from types import NoneType, UnionType
-from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+from typing import Any, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 from neuroprior._interrupts import ending_at_interrupts
 from neuroprior._version import __version__
 
-TYPES = {
-    "int": "an integer",
-    "PositiveInt": "an integer of at least 1",
-    "NonNegativeInt": "an integer of at least 0",
-    "float": "a number",
-    "PositiveFloat": "a number above 0",
-    "ClosedUnitInterval": "a number from 0 to 1",
-    "OpenUnitInterval": "a number between 0 and 1",
-    "PowerOfTwo": "a power of two",
-    "bool": "true or false",
-    "str": "a text",
-}
-"""Types of options in words."""
+LONGEST_MESSAGE = 1000
+"""Characters of an error at most: parsers may quote a whole file."""
 
 
 class Command(NamedTuple):
@@ -34,7 +24,7 @@ class Command(NamedTuple):
     Attributes:
         target: `module:function`, imported only when the command is given.
         about: one line for the list of commands.
-        raw: the function parses its arguments itself: it is called with the list of them, the command first.
+        raw: the function parses its arguments itself: it is called with the list of them.
     """
 
     target: str
@@ -79,7 +69,7 @@ def run_commands(
             raise ValueError(f"{name!r} is no command; there are {', '.join(commands)}")
         command = commands[name]
         if command.raw:
-            command.load()([name, *options])
+            command.load()(options)
         else:
             call(command.load(), f"{program} {name}", options)
 
@@ -88,10 +78,6 @@ def run_commands(
 
 def call(function: Callable[..., Any], program: str, arguments: Sequence[str]) -> Any:
     """Call a function with the arguments of a command line.
-
-    Each parameter is an option, and one without a default a positional argument. Its type hint says what may be given
-    (jsonargparse checks it), and the docstring what it means. A parameter that is a list takes several words:
-    `--worlds grid maze`.
 
     Args:
         function: with type hints and a docstring in Google style.
@@ -102,28 +88,37 @@ def call(function: Callable[..., Any], program: str, arguments: Sequence[str]) -
         What the function returns.
 
     Raises:
-        ValueError: an argument is not known or not of its type.
+        argparse.ArgumentError: an argument is not known or not of its type.
+    """
+    settings = make_parser(function, program).parse_args(list(arguments))
+    return function(**{name: _plain(value) for name, value in settings.as_dict().items()})
+
+
+def make_parser(function: Callable[..., Any], program: str, skip: Collection[str] = ()) -> Any:
+    """Return the parser (jsonargparse's) of the parameters of a function.
+
+    Each parameter is an option, and one without a default a positional argument. Its type hint says what may be given,
+    and the docstring what it means. A parameter that is a list takes several words: `--worlds grid maze`.
+
+    Args:
+        function: with type hints and a docstring in Google style.
+        program: what a user types before the options.
+        skip: parameters that are no options.
     """
     from docstring_parser import parse
-    from jsonargparse import ArgumentError, ArgumentParser
+    from jsonargparse import ArgumentParser
 
     described = parse(inspect.getdoc(function) or "")
     texts = {entry.arg_name: " ".join((entry.description or "").split()) for entry in described.params}
     about = f"{described.short_description or ''} Options may be written with hyphens for underscores."
     parser = ArgumentParser(prog=program, description=about, exit_on_error=False, allow_abbrev=True)
-    hints = get_type_hints(function)
-    items = {name: found for name, hint in hints.items() if (found := _item_of(hint)) is not None}
-    parser.add_function_arguments(function, as_group=False, as_positional=True, skip=set(items))
+    items = {name: item for name, hint in get_type_hints(function).items() if (item := _item_of(hint)) is not None}
+    parser.add_function_arguments(function, as_group=False, as_positional=True, skip={*items, *skip})
     for name, item in items.items():
-        parameter = inspect.signature(function).parameters[name]
-        default = parameter.default
+        default = inspect.signature(function).parameters[name].default
         default = list(default) if isinstance(default, list | tuple) else default
         parser.add_argument(f"--{name}", type=item, nargs="+", default=default, help=texts.get(name, "").capitalize())
-    try:
-        settings = parser.parse_args(list(arguments))
-    except ArgumentError as error:
-        raise ValueError(one_line(str(error), hints)) from error
-    return function(**{name: _plain(value) for name, value in settings.as_dict().items()})
+    return parser
 
 
 def _plain(value: Any) -> Any:
@@ -139,45 +134,6 @@ def _item_of(hint: Any) -> Any:
     if get_origin(hint) in (Union, UnionType) and len(options) == 1:
         hint = options[0]
     return get_args(hint)[0] if get_origin(hint) in (list, Sequence) else None
-
-
-def one_line(message: str, hints: Mapping[str, Any]) -> str:
-    """What the parser objects to, in one line that begins with the option."""
-    line = " ".join(message.split())
-    if unknown := re.search(r"""(?:Parser )?key "([^"]+)".*Option '([^']*)' is not accepted""", line):
-        return f"{unknown[1]}: it has no option {unknown[2]!r}"
-    if nested := re.search(r"NestedArg\(key='([^']*)'", line):
-        return f"{nested[1]}: there is no such option ({line.partition('NestedArg')[0].strip()})"
-    choice = r'Parser key "([\w.]+)": Expected a typing\.Literal\[([^]]*)\]\. Got value:(.*?)(?:\. Got value: |$)'
-    if inner := re.search(choice, line):
-        known, typed = inner[2].replace("'", ""), inner[3].strip()
-        return f"{inner[1]}: one of {known} is expected, not {typed or repr(typed)}"
-    if several := re.search(r'Parser key "([^"]+)".*Subtypes: \[(.*?)\] Errors: .*Given value: (.*)$', line):
-        kinds = [name for name in re.findall(r"<class '(?:\w+\.)*(\w+)'>", several[2]) if name != "NoneType"]
-        if kinds and several[1] not in hints:
-            expected = " or ".join(TYPES.get(name, name) for name in kinds)
-            return f"{several[1]}: {expected} is expected, not {several[3]}"
-    found = re.match(r'Parser key "([^"]+)"(?: element \d+)?: (.*)', line)
-    if found is None or found[1] not in hints:
-        return line
-    given = re.search(r"(?:Got value: |Given value: |base 10: )(.*)$", found[2])
-    given = given or re.search(r"^Not of type \w+: (.*?) does not conform", found[2])
-    value = given[1].strip("'") if given else found[2]
-    return f"{found[1]}: {_expected(hints[found[1]])} is expected, not {value}"
-
-
-def _expected(hint: Any) -> str:
-    """A type in words."""
-    hint = _item_of(hint) or hint
-    parts = [part for part in get_args(hint) if part is not NoneType] if get_origin(hint) in (Union, UnionType) else []
-    if parts:
-        return " or ".join(map(_expected, parts))
-    if get_origin(hint) is Literal:
-        return f"one of {', '.join(map(str, get_args(hint)))}"
-    name = getattr(hint, "__name__", str(hint))
-    if name not in TYPES and hasattr(hint, "_expression"):  # a restricted number
-        return f"{_expected(hint._type)} {hint._expression.replace('v', '')}"
-    return TYPES.get(name, name)
 
 
 def run_program(run: Callable[[Sequence[str]], None], arguments: Sequence[str] | None = None) -> int:
@@ -211,7 +167,7 @@ def run_program(run: Callable[[Sequence[str]], None], arguments: Sequence[str] |
         if error.filename is None or error.strerror is None:
             return _fail(f"error: {error}", 2)
         return _fail(f"error: {error.filename}: {error.strerror.lower()}", 2)
-    except (ValueError, MemoryError, OverflowError, ImportError) as error:
+    except (ValueError, MemoryError, OverflowError, ImportError, ArgumentError) as error:
         return _fail(f"error: {error}", 2)
     except RuntimeError as error:
         # torch has no exception of its own for memory that it could not get.
@@ -232,5 +188,5 @@ def _with_underscores(argument: str) -> str:
 
 
 def _fail(message: str, code: int) -> int:
-    print(" ".join(message.split()), file=sys.stderr)
+    print(shorten(message, LONGEST_MESSAGE, placeholder=" ..."), file=sys.stderr)
     return code

@@ -3,6 +3,6 @@
 from neuroprior.training.batches import Batch, PlansModule
 from neuroprior.training.module import PriorModule, bits
 from neuroprior.training.settings import Settings
-from neuroprior.training.trainer import make_trainer, quiet, run_training, train
+from neuroprior.training.trainer import train
 
-__all__ = ["Batch", "PlansModule", "PriorModule", "Settings", "bits", "make_trainer", "quiet", "run_training", "train"]
+__all__ = ["Batch", "PlansModule", "PriorModule", "Settings", "bits", "train"]

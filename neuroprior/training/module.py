@@ -7,7 +7,6 @@ import lightning
 import torch
 from torch import Tensor, nn
 
-from neuroprior._checks import is_number
 from neuroprior.training.batches import Batch
 
 
@@ -24,19 +23,12 @@ class PriorModule(lightning.LightningModule):
     Attributes:
         curve: one entry an epoch: step, learning_rate, train_bits and validation_bits (bits per action); saved in
             checkpoints.
-
-    Raises:
-        ValueError: a learning rate or weight decay out of range.
     """
 
     def __init__(
         self, prior: nn.Module, learning_rate: float = 5e-3, weight_decay: float = 0.01, seed: int = 0
     ) -> None:
         super().__init__()
-        if not is_number(learning_rate) or not 0 < learning_rate < float("inf"):
-            raise ValueError(f"learning_rate: a positive finite number is expected, not {learning_rate!r}")
-        if not is_number(weight_decay) or not 0 <= weight_decay < float("inf"):
-            raise ValueError(f"weight_decay: a finite number of at least 0 is expected, not {weight_decay!r}")
         self.prior, self.learning_rate, self.weight_decay, self.seed = prior, learning_rate, weight_decay, seed
         self.curve: list[dict[str, float]] = []
         self._hidden: Tensor | None = None
@@ -47,16 +39,13 @@ class PriorModule(lightning.LightningModule):
 
     def training_step(self, batch: Batch, batch_index: int) -> Tensor:
         # Dropout is seeded anew in each step, so that a resumed training draws the same.
-        seed = hash((self.seed, self.current_epoch, batch_index, self.global_rank)) % 2**63
+        seed = hash((self.seed, self.current_epoch, batch_index, 0)) % 2**63
         if self.device.type == "cpu":
             torch.default_generator.manual_seed(seed)  # `torch.manual_seed` takes far longer: it minds all accelerators
         else:
             torch.manual_seed(seed)
         total, weight, self._hidden = bits(self.prior, batch, self._hidden)
         loss = total / weight.clamp(min=1)
-        # Gradients are averaged over processes: each part must count by its share of the actions.
-        if self.trainer.world_size > 1:
-            loss = total * self.trainer.world_size / self._over_processes(weight).clamp(min=1)
         self._totals += torch.stack([total.detach(), weight])
         # To log takes a tenth of a small step: only where somebody reads it.
         if self.trainer.loggers or self.trainer.progress_bar_callback is not None:
@@ -65,36 +54,19 @@ class PriorModule(lightning.LightningModule):
 
     def on_validation_epoch_start(self) -> None:
         self.prior.eval()
-        self._hidden, self._held_out = None, torch.zeros(2, dtype=torch.double)
+        self._held_out = torch.zeros(2, dtype=torch.double)
 
     def validation_step(self, batch: Batch, batch_index: int) -> None:
         total, weight, self._hidden = bits(self.prior, batch, self._hidden)
         self._held_out += torch.stack([total, weight]).cpu()  # not every device has float64
 
     def on_validation_epoch_end(self) -> None:
-        self._hidden = None
-        validation, totals = self._held_out, self._totals
-        if self.trainer.world_size > 1:
-            validation = self._over_processes(validation.float().to(self.device))
-            totals = self._over_processes(totals)
-        held_out = float(validation[0] / validation[1].clamp(min=1))
-        self.log("validation_bits", held_out, prog_bar=True, rank_zero_only=True)
+        held_out = float(self._held_out[0] / self._held_out[1].clamp(min=1))
+        trained = float(self._totals[0] / self._totals[1].clamp(min=1))
         rate = self.trainer.optimizers[0].param_groups[0]["lr"]
-        self.log("learning_rate", rate, rank_zero_only=True)
-        trained = float(totals[0] / totals[1].clamp(min=1))
-        self.curve.append(
-            {
-                "step": self.global_step,
-                "learning_rate": rate,
-                "train_bits": trained,
-                "validation_bits": held_out,
-            }
-        )
-
-    def _over_processes(self, value: Tensor) -> Tensor:
-        gathered = self.all_gather(value)
-        assert isinstance(gathered, Tensor)
-        return gathered.sum(0)
+        self.log_dict({"validation_bits": held_out, "learning_rate": rate})
+        entry = {"step": self.global_step, "learning_rate": rate, "train_bits": trained}
+        self.curve.append(entry | {"validation_bits": held_out})
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["curve"] = list(self.curve)

@@ -37,7 +37,7 @@ def test_report_fit_and_score_read_it_alike(table, capsys):
     assert results["file"]["plans"] == 32
     assert (results["file"]["groups"], results["file"]["conditions"]) == (8, 2)
     assert results["unit"] == "groups"
-    fit = ["fit", "--config", "markov", "--data.file", "lab.csv", "--data.held_out", "0.25", "--out", "prior"]
+    fit = ["fit", "lab.csv", "--config", "markov", "--held_out", "0.25", "--out", "prior"]
     assert main([*fit, *COLUMNS]) == 0
     assert load("prior").action_names == ("a", "b", "c")
     assert main(["fit", "--resume", "prior"]) == 0
@@ -60,7 +60,7 @@ def test_report_fit_and_score_read_it_alike(table, capsys):
     ("options", "words"),
     [
         (["--missing", "error", *COLUMNS], "lab.csv, line 11"),
-        (["--missing", "drop", *COLUMNS], "one of gap, label, error"),
+        (["--missing", "drop", *COLUMNS], "gap"),
         (["--columns.action", "act"], "'act'"),
         (["--columns.act", "behaviour"], "act"),
         ([], "--columns.action"),

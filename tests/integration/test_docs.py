@@ -188,10 +188,8 @@ def test_commands_have_these_options() -> None:
             if not word.startswith("--"):
                 continue
             option = word[2:].partition("=")[0].replace("-", "_")
-            # what a class in a recipe takes, such as --model.prior.dropout, is listed under the class alone
+            # what a class in a recipe takes, such as --prior.dropout, is listed under the class alone
             parents = {option, option.rpartition(".")[0]} - {""}
-            # of fit, --columns.action is short for --data.columns.action
-            parents |= {f"data.{parent}" for parent in parents if parent.startswith("columns")}
             assert parents & options, f"{page}: {program} {command} has no option --{option}"
 
 

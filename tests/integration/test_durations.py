@@ -16,7 +16,7 @@ from tests.support.sources import seeded
 
 pytestmark = pytest.mark.usefixtures("undrawn")
 
-QUICK = ["--trainer.max_steps", "40", "--trainer.accelerator", "cpu", "--data.check_every", "10"]
+QUICK = ["--max_steps", "40", "--check_every", "10"]
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 def test_the_recipe_and_its_samples(file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = str(tmp_path / "run")
-    assert main(["fit", "--config", "semi-markov", "--data.file", file, "--data.end", "true", "--out", out]) == 0
+    assert main(["fit", "--config", "semi-markov", file, "--end", "true", "--out", out]) == 0
     prior = load(out)
     assert isinstance(prior, SemiMarkovPrior)
     assert isinstance(prior.actions, MarkovPrior)
@@ -49,8 +49,8 @@ def test_the_recipe_and_its_samples(file: str, tmp_path: Path, capsys: pytest.Ca
 
 
 def test_a_network_as_its_action_prior(file: str, tmp_path: Path):
-    actions = ["--model.prior.actions", "neuroprior.priors.GRUPrior", "--model.prior.actions.hidden_size", "8"]
-    run = ["--config", "semi-markov", *actions, "--data.file", file, *QUICK, "--out", str(tmp_path / "run")]
+    actions = ["--prior.actions", "neuroprior.priors.GRUPrior", "--prior.actions.hidden_size", "8"]
+    run = ["--config", "semi-markov", *actions, file, *QUICK, "--out", str(tmp_path / "run")]
     assert main(["fit", *run]) == 0
     assert load(tmp_path / "run").actions.hidden_size == 8
 
@@ -58,8 +58,8 @@ def test_a_network_as_its_action_prior(file: str, tmp_path: Path):
 @pytest.mark.slow
 def test_a_network_that_knows_the_last_durations(file: str, tmp_path: Path):
     """It is better than one that does not; score and report make the same context; a resumed run keeps it."""
-    out, gru = str(tmp_path / "run"), ["--config", "gru", "--model.prior.hidden_size", "16"]
-    assert main(["fit", *gru, "--data.file", file, "--data.past_durations", "1", *QUICK, "--out", out]) == 0
+    out, gru = str(tmp_path / "run"), ["--config", "gru", "--prior.hidden_size", "16"]
+    assert main(["fit", *gru, file, "--past_durations", "1", *QUICK, "--out", out]) == 0
     prior = load(out)
     assert isinstance(prior, GRUPrior)
     rows = json.loads((tmp_path / "run" / "metrics.json").read_text())["rows"]
@@ -74,20 +74,20 @@ def test_a_network_that_knows_the_last_durations(file: str, tmp_path: Path):
     (row,) = json.loads((tmp_path / "report" / "results.json").read_text())["rows"]
     assert row["bits_per_action"] == pytest.approx(expected, abs=1e-4)
     assert row["context"] == "actions and durations"
-    assert main(["fit", "--resume", out, "--trainer.max_steps", "60"]) == 0
+    assert main(["fit", "--resume", out]) == 0
     assert load(out).past_durations == prior.past_durations
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["markov", "--data.past_durations", "1"], ["cannot take the context"]),
-        (["gru", "--data.past_durations", "-1"], ["past_durations: at least 0"]),
-        (["semi-markov", "--data.past_durations", "1"], ["cannot take the context", "context_size"]),
+        (["markov", "--past_durations", "1"], ["`prior`", "context_size"]),
+        (["gru", "--past_durations", "-1"], ["`past_durations` must be at least 0"]),
+        (["semi-markov", "--past_durations", "1"], ["`prior`", "context_size"]),
     ],
 )
 def test_faults_are_one_line(arguments, words, file, tmp_path, capsys):
-    assert main(["fit", "--config", *arguments, "--data.file", file, "--out", str(tmp_path / "run")]) == 2
+    assert main(["fit", "--config", *arguments, file, "--out", str(tmp_path / "run")]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert all(word in said for word in words), said

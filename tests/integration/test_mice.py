@@ -271,11 +271,11 @@ def test_figures_are_written(tiny_run):
     [
         (["--seeds", "1"], "`seeds` must be at least 2"),
         (["--starts", "127"], "`starts` must be integers from 1 to 126"),
-        (["--num-plans", "4", "0"], "num_plans: an integer of at least 1"),
+        (["--num-plans", "4", "0"], "num_plans"),
         (["--num-plans", "4", "4"], "num_plans: each may be given once"),
         (["--lengths", "501"], "`lengths` must be integers from 1 to 500"),
         (["--lengths", "long"], "lengths"),
-        (["--steps", "0"], "steps: an integer of at least 1"),
+        (["--steps", "0"], "steps"),
         (["--training-plans", "2", "--seeds", "2"], "training_plans"),
     ],
 )

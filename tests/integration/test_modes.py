@@ -37,7 +37,9 @@ def file(tmp_path: Path) -> str:
 
 def test_the_number_of_modes_is_chosen_and_the_prior_saved(file, tmp_path, capsys):
     out = tmp_path / "run"
-    assert main(["fit", file, "--modes", "1", "2", "--model.prior.order", "0", "--out", str(out)]) == 0
+    assert (
+        main(["fit", file, "--config", "switching", "--modes", "1", "2", "--prior.order", "0", "--out", str(out)]) == 0
+    )
     prior = load(out)
     assert isinstance(prior, SwitchingPrior)
     assert (prior.num_modes, prior.order) == (2, 0)
@@ -50,7 +52,7 @@ def test_the_number_of_modes_is_chosen_and_the_prior_saved(file, tmp_path, capsy
 
 
 def test_the_recipe_without_a_choice(file, tmp_path):
-    assert main(["fit", "--config", "switching", "--data.file", file, "--out", str(tmp_path / "run")]) == 0
+    assert main(["fit", "--config", "switching", file, "--out", str(tmp_path / "run")]) == 0
     assert load(tmp_path / "run").num_modes == 2
 
 
@@ -59,11 +61,11 @@ def test_the_recipe_without_a_choice(file, tmp_path):
     [
         (["--modes", "0"], "modes"),
         (["--modes", "2", "--config", "markov"], "SwitchingPrior"),
-        (["--config", "switching", "--model.prior.sharing", "2"], "sharing"),
+        (["--config", "switching", "--prior.sharing", "2"], "sharing"),
     ],
 )
 def test_what_is_wrong_is_named_in_one_line(file, tmp_path, capsys, arguments, message):
-    assert main(["fit", "--data.file", file, *arguments, "--out", str(tmp_path / "run")]) == 2
+    assert main(["fit", file, *arguments, "--out", str(tmp_path / "run")]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert message in said

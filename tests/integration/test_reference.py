@@ -95,7 +95,7 @@ WITHOUT_EXAMPLE = {
         *("group_transition_figure", "lag_figure", "motif_figure", "occupancy_figure"),
         *("score_figure", "transition_figure"),
     },
-    "what fit uses": {"PlansModule", "PriorModule", "bits", "make_trainer", "quiet", "run_training", "train"},
+    "what fit uses": {"PlansModule", "PriorModule", "bits", "train"},
 }
 
 

@@ -1,12 +1,8 @@
-"""`python -m train` end to end: recipes, files, the table, faults, interruption and resuming."""
+"""`neuroprior fit` end to end: recipes, files, the table, settings that reach networks, and what is refused."""
 
 import json
-import os
-import pickle
-import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,42 +10,31 @@ import pytest
 import torch
 
 from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, TransformerPrior, load
+from neuroprior.__main__ import main
 from neuroprior.behaviour import Baseline
+from neuroprior.cli.fit_data import divide
 from neuroprior.plans import read_plans, write_minari, write_plans
 from neuroprior.priors import StackedPrior
 from neuroprior.priors.scoring import learned_from
-from neuroprior.training import PriorModule, Settings
+from neuroprior.training import Settings
 from tests.support.sources import seeded
-from train.__main__ import main
 
 pytestmark = pytest.mark.usefixtures("undrawn")
 
 ROOT = Path(__file__).parents[2]
 SMALL = {
-    "gru": ["--model.prior.hidden_size", "8"],
-    "transformer": ["--model.prior.width", "16"],
+    "gru": ["--prior.hidden_size", "8"],
+    "transformer": ["--prior.width", "16"],
     "markov": [],
-    "combined": ["--model.prior.effort", "fast"],
+    "combined": ["--effort", "fast"],
 }
-QUICK = [
-    "--data.num_plans",
-    "400",
-    "--data.world.num_worlds",
-    "40",
-    "--data.check_every",
-    "10",
-    "--data.batch_size",
-    "64",
-]
-QUICK += ["--trainer.max_steps", "30", "--trainer.accelerator", "cpu"]
-
-
-def recipe(name: str) -> list[str]:
-    return ["fit", "--config", str(ROOT / "train" / f"{name}.yaml")]
+KINDS = {"gru": GRUPrior, "transformer": TransformerPrior, "markov": MarkovPrior, "combined": CombinedPrior}
+QUICK = ["--num_plans", "400", "--world.num_worlds", "40", "--check_every", "10", "--batch_size", "64"]
+QUICK += ["--max-steps", "30"]
 
 
 def small(name: str, out: Path) -> list[str]:
-    return [*recipe(name), *SMALL[name], *QUICK, "--out", str(out)]
+    return ["fit", "--config", name, *SMALL[name], *QUICK, "--out", str(out)]
 
 
 def some_plans(num_plans: int = 300, **more) -> Plans:
@@ -62,27 +47,33 @@ def some_plans(num_plans: int = 300, **more) -> Plans:
     return Plans(actions, 3, lengths=lengths, **more)
 
 
-def run(arguments: list[str], **more) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, "-m", "train", *arguments], cwd=ROOT, capture_output=True, text=True, timeout=300, **more
-    )
+def metrics(folder: Path) -> dict:
+    return json.loads((folder / "metrics.json").read_text())
 
 
-KINDS = {"gru": GRUPrior, "transformer": TransformerPrior, "markov": MarkovPrior, "combined": CombinedPrior}
+def check_refusal(capsys, arguments: list[str], *words: str) -> None:
+    """Exit code 2, and one line."""
+    capsys.readouterr()
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ")
+    assert said.count("\n") == 1
+    assert all(word in said for word in words), said
+
+
+@pytest.fixture
+def plans_file(tmp_path) -> str:
+    write_plans(some_plans(60), tmp_path / "plans.npz")
+    return str(tmp_path / "plans.npz")
 
 
 @pytest.mark.parametrize("name", SMALL)
 def test_each_recipe(name, tmp_path, capsys):
     assert main(small(name, tmp_path / "run")) == 0
     printed = capsys.readouterr().out
-    prior = load(tmp_path / "run")
-    assert isinstance(prior, KINDS[name])
-    rows = json.loads((tmp_path / "run" / "metrics.json").read_text())["rows"]
-    models = [row["model"] for row in rows]
-    assert models[0] == "uniform"
-    assert models[-1] == name
-    assert [model for model in models if model.startswith("markov-")] == [f"markov-{k}" for k in range(7)]
-    assert "context tree" in models
+    assert isinstance(load(tmp_path / "run"), KINDS[name])
+    rows = metrics(tmp_path / "run")["rows"]
+    assert [row["model"] for row in rows] == ["uniform", *(f"markov-{k}" for k in range(7)), "context tree", name]
     for row in rows:
         assert row["low"] <= row["bits_per_action"] <= row["high"]
         assert f"{row['bits_per_action']:.4f}" in printed
@@ -91,8 +82,15 @@ def test_each_recipe(name, tmp_path, capsys):
     assert (tmp_path / "run" / "learning_curve.png").exists() == (name in ("gru", "transformer"))
 
 
+def test_python_m_train_is_the_same_program(tmp_path):
+    arguments = [sys.executable, "-m", "train", *small("markov", tmp_path / "run")]
+    done = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert load(tmp_path / "run").order == 3
+
+
 def test_the_table_is_of_the_held_out_plans(tmp_path, monkeypatch, capsys):
-    """The trained prior's row is what the saved prior takes for the plans that the split holds out.
+    """The prior's row is what the saved prior takes for the plans that are held out.
 
     Baselines learn from the training plans and are chosen on the validation plans alone: here the worst is chosen.
     """
@@ -106,328 +104,207 @@ def test_the_table_is_of_the_held_out_plans(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("neuroprior.cli.fit_report.baselines", baselines)
     write_plans(some_plans(), tmp_path / "plans.npz")
     out = tmp_path / "run"
-    assert main([*recipe("markov"), "--data.file", str(tmp_path / "plans.npz"), "--out", str(out)]) == 0
-    report = json.loads((out / "metrics.json").read_text())
-    generator = seeded(0)
+    assert main(["fit", str(tmp_path / "plans.npz"), "--config", "markov", "--out", str(out)]) == 0
+    report, generator = metrics(out), seeded(0)
     rest, held_out = some_plans().split(0.1, generator)
+    learned, chosen_on = rest.split(1 / 9, generator)
     assert report["plans"] == {"training": 240, "validation": 30, "held_out": 30}
     bits = -load(out).log_prob(held_out).sum() / torch.log(torch.tensor(2.0))
     assert report["rows"][-1]["bits_per_action"] == pytest.approx(float(bits / held_out.lengths.sum()), abs=1e-5)
-    learned, chosen_on = rest.split(1 / 9, generator)
     assert [plans.actions.tolist() for plans in given] == [learned.actions.tolist(), chosen_on.actions.tolist()]
     assert report["rows"][0]["bits_per_action"] < report["rows"][1]["bits_per_action"]
     assert report["chosen"] == "markov-0"
     assert all(learned_from(out, learned))
     assert all(learned_from(out, chosen_on))
     assert not all(learned_from(out, held_out))
-    assert "never" not in capsys.readouterr().out
-    write_plans(replace(some_plans(), num_actions=5), tmp_path / "more.npz")
-    assert main([*recipe("markov"), "--data.file", str(tmp_path / "more.npz"), "--out", str(tmp_path / "more")]) == 0
-    printed = " ".join(capsys.readouterr().out.split())
-    assert "uniform counts all 5 actions, of which 3, 4 never occur; without them it needs 1.5850 bits" in printed
     again = MarkovPrior(3, 3).fit(learned)
     assert torch.equal(again.log_prob(held_out.actions), load(out).log_prob(held_out.actions))
+    assert "never" not in capsys.readouterr().out
+    write_plans(replace(some_plans(), num_actions=5), tmp_path / "more.npz")
+    assert main(["fit", str(tmp_path / "more.npz"), "--config=markov", "--out", str(tmp_path / "more")]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "uniform counts all 5 actions, of which 3, 4 never occur; without them it needs 1.5850 bits" in printed
 
 
-def files() -> dict[str, tuple[Plans, str]]:
-    groups = torch.arange(300) // 10
-    steps = torch.randint(4, (300, 6), generator=seeded(4))
-    return {
-        "plain.npz": (some_plans(), "actions"),
-        "names.jsonl": (some_plans(action_names=("left", "on", "right"), group=groups), "actions"),
-        "context.jsonl": (some_plans(context=steps), "context"),
-        "features.npz": (some_plans(context=torch.randn(300, 2, generator=seeded(5))), "context"),
-        "rows.csv": (some_plans(group=groups), "actions"),
-        "rows.tsv": (some_plans(action_names=("left", "on", "right")), "actions"),
-        "steps.csv": (some_plans(context=steps, group=groups), "context"),
-    }
+GROUPS, STEPS = torch.arange(300) // 10, torch.randint(4, (300, 6), generator=seeded(4))
+NAMES = ("left", "on", "right")
+FILES = {
+    "plain.npz": some_plans(),
+    "names.jsonl": some_plans(action_names=NAMES, group=GROUPS),
+    "context.jsonl": some_plans(context=STEPS),
+    "features.npz": some_plans(context=torch.randn(300, 2, generator=seeded(5))),
+    "rows.csv": some_plans(group=GROUPS),
+    "rows.tsv": some_plans(action_names=NAMES),
+    "steps.csv": some_plans(context=STEPS, group=GROUPS),
+    "minari:mice/train-v0": some_plans(context=STEPS),
+}
 
 
-@pytest.mark.parametrize("name", files())
-def test_each_kind_of_file(name, tmp_path):
-    plans, takes = files()[name]
-    write_plans(plans, tmp_path / name)
-    kind = "gru" if name == "features.npz" else "markov"  # features cannot be counted
-    assert main([*small(kind, tmp_path / "run"), "--data.file", str(tmp_path / name)]) == 0
-    report = json.loads((tmp_path / "run" / "metrics.json").read_text())
+@pytest.mark.parametrize("name", FILES)
+def test_each_kind_of_file(name, tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    plans, kind = FILES[name], "gru" if name == "features.npz" else "markov"  # features cannot be counted
+    if name.startswith("minari:"):
+        write_minari(plans, name.removeprefix("minari:"))
+    else:
+        write_plans(plans, tmp_path / name)
+        name = str(tmp_path / name)
+    assert main([*small(kind, tmp_path / "run"), name]) == 0
+    report = metrics(tmp_path / "run")
     assert report["unit"] == ("plans" if plans.group is None else "groups")
-    assert ("context" in report["rows"][-1]["context"]) == (takes == "context")
+    assert ("context" in report["rows"][-1]["context"]) == (plans.context is not None)
+    assert load(tmp_path / "run").takes_context == (plans.context is not None)
     assert read_plans(tmp_path / "run" / "plans.npz").actions.shape == plans.actions.shape
 
 
-def test_a_minari_dataset(tmp_path, monkeypatch):
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    write_minari(some_plans(60, context=torch.randint(4, (60, 6), generator=seeded(4))), "mice/train-v0")
-    assert main([*small("markov", tmp_path / "run"), "--data.file", "minari:mice/train-v0"]) == 0
-    assert load(tmp_path / "run").num_contexts == 4
-
-
-def test_an_end_symbol(tmp_path):
-    write_plans(some_plans(), tmp_path / "plans.npz")
-    arguments = ["--data.file", str(tmp_path / "plans.npz"), "--data.end", "true", "--out", str(tmp_path / "run")]
-    assert main([*recipe("markov"), "--model.prior.order", "6", *arguments]) == 0
+def test_an_end_symbol(tmp_path, plans_file):
+    arguments = ["--config", "markov", "--prior.order", "6", "--end", "true", "--out", str(tmp_path / "run")]
+    assert main(["fit", plans_file, *arguments]) == 0
     prior = load(tmp_path / "run")
     assert prior.end == 3
-    lengths = Plans(prior.sample(4000, 9, generator=seeded(0)), 4, end=3).without_end().lengths
-    drawn = lengths.bincount(minlength=10)
-    assert drawn[2:7].min() > 400
-    assert drawn[2:7].sum() > 3600
+    lengths = Plans(prior.sample(400, 9, generator=seeded(0)), 4, end=3).without_end().lengths
+    assert lengths.bincount(minlength=10)[2:7].sum() > 300
 
 
-@pytest.mark.slow
-def test_two_processes_learn_what_one_does(tmp_path):
-    exactly = ["--model.prior.dropout", "0"]
-    two = run([*small("gru", tmp_path / "two"), *exactly, "--trainer.devices", "2", "--trainer.strategy", "ddp"])
-    assert two.returncode == 0, two.stderr
-    assert main([*small("gru", tmp_path / "one"), *exactly]) == 0
-    curves = [json.loads((tmp_path / name / "metrics.json").read_text())["curve"] for name in ("one", "two")]
-    assert len(curves[0]) == len(curves[1]) == 3
-    for one, other in zip(*curves, strict=True):
-        assert one["step"] == other["step"]
-        assert one["validation_bits"] == pytest.approx(other["validation_bits"], abs=1e-4)
+@pytest.mark.parametrize("per", [(300,), (300, 6)])
+@pytest.mark.parametrize("name", ["gru", "markov"])
+def test_a_context_that_only_held_out_plans_have(per, name, tmp_path):
+    """It is counted among the contexts, and what is paid there is a finite number."""
+    _, held_out = some_plans(group=torch.arange(300)).split(0.1, seeded(0))
+    context = torch.randint(3, per, generator=seeded(4))
+    context[int(held_out.group[0])] = 7
+    write_plans(some_plans(context=context), tmp_path / "plans.npz")
+    assert main([*small(name, tmp_path / "run"), str(tmp_path / "plans.npz")]) == 0
+    assert load(tmp_path / "run").num_contexts == 8
+    assert all(0 < row["bits_per_action"] < 10 for row in metrics(tmp_path / "run")["rows"])
 
 
-@pytest.fixture(scope="module")
-def plans_file(tmp_path_factory) -> str:
-    place = tmp_path_factory.mktemp("plans") / "plans.npz"
-    write_plans(some_plans(60), place)
-    return str(place)
+def test_the_number_of_contexts_may_be_more_than_occur(tmp_path):
+    write_plans(Plans(torch.zeros(30, 4).long(), 2, context=torch.arange(120).view(30, 4) % 3), tmp_path / "plans.npz")
+    options = ["--config", "markov", "--prior.num_contexts", "8", "--out", str(tmp_path / "run")]
+    assert main(["fit", str(tmp_path / "plans.npz"), *options]) == 0
+    assert load(tmp_path / "run").num_contexts == 8
 
 
 INSIDE = '[{"prior": "MarkovPrior", "config": {"num_actions": 3}}, {"prior": "GRUPrior", "config": {"num_actions": 3}}]'
 INNER = '{"prior": "GRUPrior", "config": {"num_actions": 5, "hidden_size": 8}}'
 MADE_OF_PRIORS = {
-    "StackedPrior": ["--model.prior.hidden_size", "8", "--model.prior.depth", "2"],
-    "MixturePrior": ["--model.prior.experts", INSIDE],
-    "MacroPrior": ["--model.prior.inner", INNER],
+    "StackedPrior": ["--prior.hidden_size", "8", "--prior.depth", "2"],
+    "MixturePrior": ["--prior.experts", INSIDE],
+    "MacroPrior": ["--prior.inner", INNER],
 }
 
 
 @pytest.mark.parametrize("name", MADE_OF_PRIORS)
-def test_the_settings_of_a_recipe_reach_the_networks_inside_other_priors(name, plans_file, tmp_path, monkeypatch):
+def test_settings_reach_the_networks_inside_other_priors(name, plans_file, tmp_path, monkeypatch):
     """All of them, and a seed that depends on that of the command."""
     trained = []
     monkeypatch.setattr("neuroprior.training.train", lambda prior, plans, how, seed: trained.append((how, seed)))
-    asked = {"trainer": {"max_steps": 3, "patience": 7, "gradient_clip_val": 0.3, "enable_progress_bar": "false"}}
-    asked |= {"data": {"batch_size": 16, "window": 5, "validation": 0.2, "check_every": 2}}
-    asked |= {"model": {"learning_rate": 0.02, "weight_decay": 0.5}}
-    options = [f"--{part}.{option}={value}" for part, own in asked.items() for option, value in own.items()]
+    asked = {"max_steps": 3, "batch_size": 16, "window": 5, "learning_rate": 0.02, "weight_decay": 0.5, "patience": 7}
+    asked |= {"gradient_clip": 0.3, "validation": 0.2, "check_every": 2}
+    options = [f"--{option}={value}" for option, value in asked.items()]
     for seed in ("0", "1"):
-        arguments = ["--model.prior", name, *MADE_OF_PRIORS[name], *options, "--data.file", plans_file]
-        assert main(["fit", *arguments, "--seed_everything", seed, "--out", str(tmp_path / seed)]) == 0
-    due = Settings(3, 16, 5, 0.02, 0.5, gradient_clip=0.3, validation=0.2, check_every=2, patience=7, progress=False)
+        arguments = ["fit", plans_file, "--prior", name, *MADE_OF_PRIORS[name], *options, "--progress=false"]
+        assert main([*arguments, "--seed", seed, "--out", str(tmp_path / seed)]) == 0
     (first, seed), (second, other) = trained
     if name == "MixturePrior":  # its networks are stopped by the plans on which its weights are learned
         assert len(first.validation) == len(second.validation) == round(0.2 * 42)  # 42 are learned from
         first, second = (replace(how, validation=0.2) for how in (first, second))
-    assert first == second == due
+    assert first == second == Settings(**asked, progress=False)
     assert seed != other
 
 
-def test_a_file_alone_is_learned_by_the_combined_prior(plans_file, tmp_path):
-    quick = ["--trainer.max_steps", "3", "--effort", "fast", "--out", str(tmp_path / "run")]
+def test_a_network_is_stopped_by_the_validation_plans(plans_file, tmp_path, monkeypatch):
+    given = []
+    monkeypatch.setattr("neuroprior.cli.fit.train", lambda *arguments: given.extend(arguments) or [])
+    quick = ["--config", "gru", "--max_steps", "7", "--seed", "3", "--out", str(tmp_path / "run")]
     assert main(["fit", plans_file, *quick]) == 0
+    _, plans, how, seed, folder = given
+    parts = divide(some_plans(60), seed=3)
+    assert plans.actions.equal(parts.learned_from.actions)
+    assert how.validation.actions.equal(parts.chosen_on.actions)
+    assert (replace(how, validation=0.1), seed, folder) == (Settings(7), 3, tmp_path / "run")
+
+
+def test_what_is_not_set_is_left_to_the_prior_and_folds_are_silent(plans_file, tmp_path, monkeypatch):
+    trained, reported = [], []
+    monkeypatch.setattr("neuroprior.training.train", lambda prior, plans, how, seed: trained.append(how))
+    monkeypatch.setattr("neuroprior.cli.fit.report", lambda *given: reported.append(given[-1]))
+    arguments = ["--prior", "StackedPrior", *MADE_OF_PRIORS["StackedPrior"], "--out", str(tmp_path / "run")]
+    assert main(["fit", plans_file, *arguments]) == 0
+    StackedPrior(3, 8, depth=2).fit(some_plans(60))
+    assert trained[0] == trained[1]
+    assert reported == [{"progress": False}]
+
+
+def test_a_file_alone_is_learned_by_the_combined_prior(plans_file, tmp_path):
+    quick = ["--max_steps", "3", "--effort", "fast"]
+    assert main(["fit", plans_file, *quick, "--out", str(tmp_path / "run")]) == 0
     prior = load(tmp_path / "run")
     assert isinstance(prior, CombinedPrior)
     assert prior.effort == "fast"
-    first = ["fit", "--effort=fast", *recipe("combined")[1:], "--data.file", plans_file]
-    assert main([*first, "--trainer.max_steps", "3", "--out", str(tmp_path / "other")]) == 0
-    assert load(tmp_path / "other").log_prob(some_plans(60)).equal(prior.log_prob(some_plans(60)))
-    row = json.loads((tmp_path / "run" / "metrics.json").read_text())["rows"][-1]
+    row = metrics(tmp_path / "run")["rows"][-1]
     assert (row["model"], row["how"]) == ("combined", prior.summary())
-    assert main(["fit", "--resume", str(tmp_path / "run")]) == 0
-    assert load(tmp_path / "run").log_prob(some_plans(60)).equal(prior.log_prob(some_plans(60)))
+    assert main(["fit", *quick, "--config=combined", plans_file, "--out", str(tmp_path / "other")]) == 0
+    assert load(tmp_path / "other").log_prob(some_plans(60)).equal(prior.log_prob(some_plans(60)))
 
 
-def test_what_a_recipe_does_not_set_is_left_to_the_prior(plans_file, tmp_path, monkeypatch):
-    trained = []
-    monkeypatch.setattr("neuroprior.training.train", lambda prior, plans, how, seed: trained.append(how))
-    arguments = ["--model.prior", "StackedPrior", *MADE_OF_PRIORS["StackedPrior"], "--data.file", plans_file]
-    assert main(["fit", *arguments, "--out", str(tmp_path / "run")]) == 0
-    StackedPrior(3, 8, depth=2).fit(some_plans(60))
-    assert trained[0] == trained[1]
-
-
-def test_folds_are_silent_also_with_default_settings(plans_file, tmp_path, monkeypatch):
-    """Bars and lines of several processes would get mixed."""
-    given = []
-    monkeypatch.setattr("neuroprior.cli.fit.report", lambda *_: given.append(_[-1]))
-    monkeypatch.setattr("neuroprior.training.train", lambda *_: 0.0)
-    arguments = ["--model.prior", "StackedPrior", *MADE_OF_PRIORS["StackedPrior"], "--data.file", plans_file]
-    assert main(["fit", *arguments, "--out", str(tmp_path / "run")]) == 0
-    assert given == [{"progress": False}]
-
-
-def test_options_that_networks_inside_other_priors_cannot_have_are_refused(plans_file, tmp_path, capsys):
-    arguments = ["fit", "--model.prior", "StackedPrior", "--data.file", plans_file, "--out", str(tmp_path / "run")]
-    assert main([*arguments, "--trainer.precision", "bf16-mixed"]) == 2
-    said = capsys.readouterr().err
-    assert "trainer.precision" in said
-    assert said.count("\n") == 1
-    assert not list((tmp_path / "run").rglob("*.*"))
-
-
-@pytest.mark.parametrize("name", ["plans.npz", "config.json"])
-def test_files_of_others_are_not_written_over(name, plans_file, tmp_path, capsys):
-    (tmp_path / name).write_bytes(Path(plans_file).read_bytes())
-    assert main(["fit", "--config", "markov", "--data.file", plans_file, "--out", str(tmp_path)]) == 2
-    assert f"out: {tmp_path / name} is there, and of no run that began; move it away" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == [name]
-
-
-def test_the_number_of_contexts_of_a_recipe_may_be_more_than_occur(tmp_path):
-    plans = Plans(torch.zeros(30, 4, dtype=torch.long), 2, context=torch.arange(120).view(30, 4) % 3)
-    write_plans(plans, tmp_path / "plans.npz")
-    options = ["--data.file", str(tmp_path / "plans.npz"), "--model.prior.num_contexts", "8"]
-    assert main(["fit", "--config", "markov", *options, "--out", str(tmp_path / "run")]) == 0
-    assert load(tmp_path / "run").num_contexts == 8
-
-
-def test_a_recipe_by_name(plans_file, tmp_path, capsys, monkeypatch):
-    """In any folder; where there is no such recipe the known ones are listed."""
-    monkeypatch.chdir(tmp_path)
-    assert main(["fit", "--config", "markov", "--data.file", plans_file, "--out", "run"]) == 0
-    assert load("run").order == 3
-    capsys.readouterr()
-    for arguments in (["--config", "markof"], ["--config=markof"]):
-        assert main(["fit", *arguments]) == 2
-        said = capsys.readouterr().err
-        assert said.count("\n") == 1
-        assert "'markof'" in said
-        assert "gru, markov, semi-markov, switching, transformer" in said
-
-
-LONG = ["--data.check_every", "5", "--trainer.max_steps", "100", "--trainer.patience", "100"]
-LONG += ["--model.prior.dropout", "0.1"]
-
-
-@pytest.mark.slow  # runs that are killed at set moments are resumed in test_train_resume.py
-def test_killed_and_resumed_gives_the_same_prior_bit_for_bit(tmp_path):
-    assert main([*small("gru", tmp_path / "whole"), *LONG]) == 0
-    process = subprocess.Popen(
-        [sys.executable, "-m", "train", *small("gru", tmp_path / "cut"), *LONG],
-        cwd=ROOT,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    last = tmp_path / "cut" / "checkpoints" / "last.ckpt"
-    while not last.exists() and process.poll() is None:
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert not (tmp_path / "cut" / "model.safetensors").exists(), "killed too late to test anything"
-    moved = tmp_path / "moved"
-    os.rename(tmp_path / "cut", moved)
-    assert main(["fit", "--resume", str(moved)]) == 0
-    for name in ("model.safetensors",):
-        assert (moved / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
-    first, second = (json.loads((f / "metrics.json").read_text()) for f in (tmp_path / "whole", moved))
-    assert len(first["curve"]) == 20
-    assert first["curve"] == second["curve"]
-    assert first["rows"] == second["rows"]
-
-
-def test_ctrl_c_says_how_to_resume(tmp_path, capsys, monkeypatch):
-    step, calls = PriorModule.training_step, []
-
-    def interrupted(self, *batch):
-        calls.append(batch)
-        if len(calls) == 15:
-            raise KeyboardInterrupt
-        return step(self, *batch)
-
-    monkeypatch.setattr(PriorModule, "training_step", interrupted)
-    out = tmp_path / "run"
-    assert main(small("gru", out)) == 130
-    said = capsys.readouterr().err
-    assert "saved up to step 10" in said
-    assert f"--resume {out}" in said
-    assert said.count("\n") == 1
-    assert main(["fit", "--resume", str(out)]) == 0
-    assert [row["step"] for row in json.loads((out / "metrics.json").read_text())["curve"]] == [10, 20, 30]
+def test_a_long_sequence_is_read_in_windows(tmp_path):
+    write_plans(Plans((torch.arange(6000) // 3 % 4)[None], 4), tmp_path / "plans.npz")
+    exactly = ["--window", "16", "--prior.dropout", "0", "--prior.lags", "16", "--max_steps", "120"]
+    assert main([*small("gru", tmp_path / "run"), str(tmp_path / "plans.npz"), *exactly]) == 0
+    assert metrics(tmp_path / "run")["unit"] == "parts of the plan"
+    assert metrics(tmp_path / "run")["rows"][-1]["bits_per_action"] < 0.5
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "words"),
     [
-        (["fit"], "--config"),
-        ([*recipe("gru"), "--data.file", "missing.npz"], "missing.npz"),
-        ([*recipe("gru"), "--model.prior.hidden_size", "0"], "hidden_size"),
-        ([*recipe("gru"), "--model.prior", "NoPrior"], "NoPrior"),
-        ([*recipe("gru"), "--nonsense", "1"], "nonsense"),
-        ([*recipe("gru"), "--trainer.devices", "0"], "devices"),
-        ([*recipe("gru"), "--effort", "fast"], "error: model.prior: it has no option 'effort'"),
-        (
-            ["fit", "--config=gru", "--effort", "fast"],
-            "error: effort: it is of the recipe combined, and the recipe gru",
-        ),
-        (
-            [*recipe("combined"), "--effort", "quick"],
-            "error: effort: one of fast, standard, full is expected, not quick",
-        ),
-        ([*recipe("combined"), "--effort", "a b"], "error: effort: one of fast, standard, full is expected, not a b\n"),
-        ([*recipe("combined"), "--effort="], "error: effort: one of fast, standard, full is expected, not ''\n"),
-        ([*recipe("combined"), "--effort", "--seed_everything", "1"], "error: effort: fast, standard or full"),
-        ([*recipe("gru"), "--missing", "foo"], "error: data.missing: one of gap, label, error is expected, not foo\n"),
-        (["fit", "--effort", "fast"], "--config"),
-        (["fit", "--config", "missing.yaml"], "missing.yaml"),
-        (["fit", "--resume", "missing"], "run.yaml"),
-        ([*recipe("gru"), "--data.held_out", "0.95"], "held_out"),
-        ([*recipe("gru"), "--data.world", "null"], "--data.file"),
-        ([], "fit"),
+        ("", ["plans", "--config", "gru, markov, semi-markov"]),
+        ("missing.npz", ["missing.npz"]),
+        ("bad.npz", ["bad.npz"]),
+        ("PLANS --config markof", ["`config`", "gru, markov, semi-markov", "markof"]),
+        ("PLANS --config bad.npz", ["`config`", "bad.npz"]),
+        ("PLANS --config words.yaml", ["`config`", "words.yaml"]),
+        ("PLANS --prior NoPrior", ["NoPrior"]),
+        ("PLANS --prior GRUPrior --prior.hidden 8", ["prior", "hidden"]),
+        ("PLANS --prior GRUPrior --prior.hidden_size 0", ["hidden_size"]),
+        ("PLANS --nonsense 1", ["nonsense"]),
+        ("PLANS --config gru --effort fast", ["effort"]),
+        ("PLANS --effort quick", ["effort", "standard", "quick"]),
+        ("PLANS --modes 2", ["SwitchingPrior", "CombinedPrior"]),
+        ("PLANS --validation 0.6 --held_out 0.5", ["must be above 0 and below 1, got 1.1"]),
+        ("PLANS --past_durations -1", ["`past_durations`"]),
+        ("PLANS --folds 61", ["`folds` must be from 1 to 60, the number of plans"]),
+        ("PLANS --max_steps 0", ["`max_steps` must be a whole number of at least 1, got 0."]),
+        ("PLANS --learning_rate=-1", ["`learning_rate`"]),
+        ("PLANS --weight_decay=-1", ["`weight_decay`"]),
+        ("PLANS --out .", ["`out` must be a new or empty folder, got .; --resume ."]),
+        ("--config gru --world null", ["`plans`"]),
     ],
 )
-def test_bad_input_is_one_line(arguments, says, tmp_path, capsys, monkeypatch):
+def test_bad_input_is_named_before_anything_is_written(arguments, words, plans_file, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main([*arguments, *(["--out", "run"] if "--config" in arguments else [])]) == 2
-    said = capsys.readouterr().err
-    assert says in said
-    assert said.count("\n") == 1
-    assert "Traceback" not in said
+    Path("bad.npz").write_bytes(b"\xff\xfe\x00")
+    Path("words.yaml").write_text("just words")
+    before = set(tmp_path.rglob("*"))
+    check_refusal(capsys, ["fit", *("plans.npz" if word == "PLANS" else word for word in arguments.split())], *words)
+    assert {path for path in set(tmp_path.rglob("*")) - before if path.is_file()} == set()
 
 
-def test_a_run_is_never_overwritten(tmp_path, capsys):
-    assert main(small("markov", tmp_path / "run")) == 0
-    before = {path.name: path.read_bytes() for path in (tmp_path / "run").glob("*.*")}
-    assert main(small("gru", tmp_path / "run")) == 2
-    assert "--resume" in capsys.readouterr().err
-    assert {path.name: path.read_bytes() for path in (tmp_path / "run").glob("*.*")} == before
+FEW = {
+    "two plans": (some_plans(2), ["3 plans", "got 2"]),
+    "two groups": (some_plans(9, group=torch.arange(9) // 5), ["3 groups", "got 2"]),
+    "two plans of one group": (some_plans(2, group=torch.zeros(2).long()), ["3 plans", "got 2"]),
+    "two actions": (Plans(torch.tensor([[0, 1]]), 2), ["3 actions", "got 2"]),
+    "no actions": (Plans(torch.zeros(9, 1).long(), 2, torch.zeros(9).long()), ["actions"]),
+    "one action each": (Plans(torch.zeros(9, 1).long(), 2), ["`validation`", "at least 2 actions", "got 1"]),
+}
 
 
-class Poison:
-    def __init__(self, target):
-        self.target = target
-
-    def __reduce__(self):
-        return (Path.touch, (self.target,))
-
-
-def test_no_pickle_is_executed(tmp_path, capsys):
-    out = tmp_path / "run"
-    assert main(small("gru", out)) == 0
-    for name in ("checkpoints/last.ckpt", "checkpoints/best.ckpt"):
-        torch.save({"state_dict": Poison(tmp_path / "poisoned")}, out / name)
-    capsys.readouterr()
-    assert main(["fit", "--resume", str(out)]) == 2
-    assert "last.ckpt" in capsys.readouterr().err
-    (out / "plans.npz").write_bytes(pickle.dumps(Poison(tmp_path / "poisoned")))
-    assert main(["fit", "--resume", str(out)]) == 2
-    assert not (tmp_path / "poisoned").exists()
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_an_unwritable_folder_is_one_line(tmp_path, capsys):
-    tmp_path.chmod(0o500)
-    assert main(small("gru", tmp_path / "run")) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-
-
-def test_a_long_sequence_trains_in_windows(tmp_path):
-    actions = torch.arange(6000) // 3 % 4
-    write_plans(Plans(actions[None], 4), tmp_path / "plans.npz")
-    arguments = ["--data.file", str(tmp_path / "plans.npz"), "--data.window", "16", "--out", str(tmp_path / "run")]
-    exactly = ["--model.prior.dropout", "0", "--model.prior.lags", "16", "--trainer.max_steps", "120"]
-    assert main([*recipe("gru"), *SMALL["gru"], *QUICK, *arguments, *exactly]) == 0
-    report = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert report["unit"] == "parts of the plan"
-    assert report["rows"][-1]["bits_per_action"] < 0.5
+@pytest.mark.parametrize("name", FEW)
+def test_too_few_plans(name, tmp_path, capsys):
+    plans, words = FEW[name]
+    write_plans(plans, tmp_path / "plans.npz")
+    check_refusal(capsys, [*small("gru", tmp_path / "run"), str(tmp_path / "plans.npz")], *words)
+    assert not (tmp_path / "run").exists()

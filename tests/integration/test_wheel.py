@@ -76,10 +76,10 @@ def test_the_five_commands(installed: Path, tmp_path: Path) -> None:
     assert events["animal"].nunique() == 12
     events[events["animal"].isin(events["animal"].unique()[:3])].to_csv(tmp_path / "few.csv", index=False)
     study = ["few.csv", "--columns.action", "behaviour", "--columns.plan", "session", "--columns.group", "animal"]
-    quick = ["--trainer.max_steps", "5", "--trainer.accelerator", "cpu", "--data.folds", "1"]
+    quick = ["--max_steps", "5", "--folds", "1"]
     commands = [
         ["example", "study.csv"],
-        ["fit", "--config", "gru", "--data.file", *study, "--out", "gru", *quick],
+        ["fit", "--config", "gru", *study, "--out", "gru", *quick],
         ["report", *study, "--priors", "gru", "--out", "report"],
         ["score", "gru", *study, "--out", "score"],
         ["sample", "gru", "--num-plans", "7", "--length", "5"],
@@ -106,7 +106,8 @@ def test_the_five_commands(installed: Path, tmp_path: Path) -> None:
 
 def test_bad_input_is_one_line(installed: Path, tmp_path: Path) -> None:
     said = run(installed, tmp_path, "sample", "nowhere", "--num-plans", "0", code=2).stderr
-    assert said == "error: num_plans: an integer of at least 1 is expected, not 0\n"
+    assert said.startswith('error: Parser key "num_plans": Not of type PositiveInt: 0')
+    assert said.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -114,7 +115,7 @@ def test_bad_input_is_one_line(installed: Path, tmp_path: Path) -> None:
     [
         (["score", "nowhere", "plans.csv"], "nowhere"),
         (["sample", "nowhere"], "nowhere"),
-        (["fit", "--config", "gruu", "--data.file", "x.csv"], "gru"),
+        (["fit", "--config", "gruu", "x.csv"], "gru"),
         (["report", "nowhere.csv"], "nowhere.csv"),
         (["example", "."], "ends in .csv"),
         (["paint"], "there are fit, report, score, sample"),

@@ -7,7 +7,7 @@ import torch
 
 from neuroprior import GRUPrior, Plans, TransformerPrior
 from neuroprior.training import PlansModule, Settings, bits
-from neuroprior.training.batches import MOST_VALIDATION, Walk, Windows
+from neuroprior.training.batches import MAX_VALIDATION_ACTIONS, Walk, Windows
 from tests.support.sources import refuses, seeded
 
 SMALL = [GRUPrior(3, 8, lags=4, seed=1), GRUPrior(3, 8, num_layers=2, lags=1), TransformerPrior(3, 16, lags=3, seed=1)]
@@ -24,7 +24,7 @@ def test_a_pass_reads_every_action_once_and_in_order(window, batch_size):
     plans = long_plans()
     windows = PlansModule(plans, plans, Settings(batch_size=batch_size, window=window), seed=3).training
     current = []
-    for index in Walk(windows, windows.steps, 3, (0, 1)):
+    for index in Walk(windows, windows.steps, 3):
         batch = windows[index]
         for row in range(len(batch.actions)):
             taken = batch.weight[row] > 0
@@ -50,24 +50,11 @@ def test_a_pass_reads_every_action_once_and_in_order(window, batch_size):
     assert torch.equal(steps.bool(), plans.mask())
 
 
-@pytest.mark.parametrize("parts", [2, 3, 8])
-def test_processes_share_each_batch(parts):
-    windows = Windows(long_plans(7), 4, 3)
-    whole = list(Walk(windows, 12, 0, (0, 1)))
-    shares = [list(Walk(windows, 12, 0, (n, parts))) for n in range(parts)]
-    for step, (pieces, number, continues, _) in enumerate(whole):
-        mine = [share[step] for share in shares]
-        assert all((one.number, one.continues) == (number, continues) for one in mine)
-        assert sorted(torch.cat([one.pieces for one in mine if one.counts]).tolist()) == sorted(pieces.tolist())
-        assert all(float(windows[one].weight.sum()) == 0 for one in mine if not one.counts)
-        assert all(len(one.pieces) for one in mine), "a process without anything to read would keep the others waiting"
-
-
 def test_an_epoch_depends_on_its_number_and_the_seed_alone():
     windows = Windows(long_plans(9), 4, 2)
 
     def epoch(number: int, seed: int = 0):
-        walk = Walk(windows, 10, seed, (0, 1))
+        walk = Walk(windows, 10, seed)
         walk.set_epoch(number)
         return [(step.pieces.tolist(), step.number, step.continues) for step in walk]
 
@@ -78,7 +65,7 @@ def test_an_epoch_depends_on_its_number_and_the_seed_alone():
     assert {number for _, number, _ in first} > {0}
     assert not any(continues for _, _, continues in first)
     # No pass of one seed is a pass of the next.
-    walks = [Walk(windows, 6 * windows.steps, seed, (0, 1)) for seed in (0, 1)]
+    walks = [Walk(windows, 6 * windows.steps, seed) for seed in (0, 1)]
     pieces = [torch.cat([step.pieces for step in walk if step.number == 0]).view(6, -1).tolist() for walk in walks]
     assert not any(order in pieces[1] for order in pieces[0])
 
@@ -88,10 +75,10 @@ def test_windows_with_the_hidden_state_cost_what_the_whole_costs(prior):
     prior.set_training_window(40)
     plans = long_plans()
     lengths = torch.tensor([37, 33, 29, 36, 30])
-    windows = Windows(Plans(plans.actions, 3, lengths=lengths), 5, 100, least_windows=8)
+    windows = Windows(Plans(plans.actions, 3, lengths=lengths), 5, 100, min_windows=8)
     assert windows.windows == 8, "pieces as long as the longest plan, so that the hidden state goes all the way"
     total, hidden = 0.0, None
-    for index in Walk(windows, None, None, (0, 1)):
+    for index in Walk(windows):
         cost, _, hidden = bits(prior, windows[index], hidden)
         total += float(cost.detach())
     whole = -float(prior.log_prob(Plans(plans.actions, 3, lengths)).sum().detach()) / math.log(2)
@@ -140,7 +127,7 @@ def test_a_window_of_its_own_does_not_go_with_long_plans():
 
 def test_the_seed_draws_what_is_validated():
     """As few plans as have enough actions: two of eight, the same for one seed, others for other seeds."""
-    actions = torch.randint(2, (8, MOST_VALIDATION * 3 // 4), generator=seeded(0), dtype=torch.uint8)
+    actions = torch.randint(2, (8, MAX_VALIDATION_ACTIONS * 3 // 4), generator=seeded(0), dtype=torch.uint8)
     some = Plans(actions[:, :9], 2)
     drawn = [PlansModule(some, Plans(actions, 2), Settings(), seed).validation.plans.actions for seed in range(6)]
     assert all(len(plans) == 2 for plans in drawn)
@@ -148,27 +135,22 @@ def test_the_seed_draws_what_is_validated():
     assert sum(not plans.equal(drawn[0]) for plans in drawn) > 2
 
 
-def test_validation_reads_no_more_than_it_must():
-    actions = torch.randint(2, (3, MOST_VALIDATION), generator=seeded(0))
-    data = PlansModule(Plans(actions[:, :9], 2), Plans(actions, 2), Settings(), 0)
-    assert len(data.validation.plans) == 1
-    # one long plan does not crowd out the short ones, and those without actions are ignored
-    lengths = torch.cat([torch.tensor([12_000]), torch.full((300,), 10), torch.zeros(50, dtype=torch.long)])
-    many = Plans(torch.zeros(351, 12_000, dtype=torch.uint8), 2, lengths=lengths)
-    assert len(PlansModule(Plans(actions[:, :9], 2), many, Settings(), 0).validation.plans) == 301
-    # one that has enough actions by itself is still read with others
-    lengths = torch.cat([torch.tensor([17_000]), torch.full((2000,), 10), torch.zeros(50, dtype=torch.long)])
-    many = Plans(torch.zeros(2051, 17_000, dtype=torch.uint8), 2, lengths=lengths)
-    assert len(PlansModule(Plans(actions[:, :9], 2), many, Settings(), 0).validation.plans) == 256
-
-
 @pytest.mark.parametrize(
-    ("number", "length", "read"), [(2000, 16, 1024), (300, 100, 256), (40, 1000, 40), (90, 1000, 66)]
+    ("lengths", "read"),
+    [
+        ([16] * 2000, 1024),  # enough actions, of enough plans
+        ([100] * 300, 256),  # enough plans
+        ([1000] * 40, 40),  # too few plans: all
+        ([1000] * 90, 66),  # as many actions as are read at most
+        ([MAX_VALIDATION_ACTIONS] * 3, 1),
+        ([12_000, *[10] * 300, *[0] * 50], 301),  # a long one does not crowd out the others; empty ones are ignored
+        ([17_000, *[10] * 2000, *[0] * 50], 256),
+    ],
 )
-def test_validation_reads_enough_actions_of_enough_plans(number, length, read):
+def test_validation_reads_enough_actions_of_enough_plans(lengths, read):
     """2 ** 14 actions, if these are of 256 plans; else 256 plans, or 2 ** 16 actions if these are of fewer plans."""
-    actions = torch.randint(57, (number, length), generator=seeded(0))
-    data = PlansModule(Plans(actions[:, :9], 57), Plans(actions, 57), Settings(), 0)
+    actions = torch.arange(max(lengths)).remainder(57).to(torch.uint8).expand(len(lengths), -1)
+    data = PlansModule(long_plans(), Plans(actions, 57, torch.tensor(lengths)), Settings(), 0)
     assert len(data.validation.plans) == read
 
 
@@ -179,7 +161,7 @@ def test_the_hidden_state_is_carried_by_default(num_plans, length):
     for windows in (data.training, data.validation):
         longest = -(-length // 128)
         assert windows.windows >= min(8, longest)
-        share = sum(step.continues for step in Walk(windows, None, None, (0, 1))) / windows.steps
+        share = sum(step.continues for step in Walk(windows)) / windows.steps
         assert share >= 0.8
 
 

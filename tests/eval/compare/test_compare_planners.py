@@ -57,7 +57,7 @@ def test_a_small_comparison(tmp_path, capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        (["best"], "planners: one of sampling, frontier"),
+        (["best"], "sampling"),
         (["mcts", "mcts"], "planners: each may be given"),
         (["mcts", "--worlds", "grid", "slippery"], "planners: none of mcts is for slippery"),
         (["halving", "--worlds", "grid"], "planners: none of halving is for grid"),

@@ -226,7 +226,7 @@ def test_a_prior_that_does_not_fit_is_refused(tmp_path):
     with refuses("nowhere", error=FileNotFoundError):
         load_for(str(tmp_path / "nowhere"), "maze", 3, None)
     ends = save(MarkovPrior(4, 1).fit(learned().with_end()), tmp_path / "ends")
-    with refuses("ends", "end symbol", "--data.end"):
+    with refuses("ends", "end symbol", "--end"):
         load_for(str(ends), "maze", 4, None)
     with pytest.raises(NotImplementedError):
         load_for(folder, "maze", 3, NAMES[::-1]).fit(learned())
