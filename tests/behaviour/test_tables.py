@@ -436,7 +436,7 @@ def test_durations_and_conditions_stay_with_their_plans():
     for fields, words in (
         ({"durations": torch.tensor([[1.0, -1], [1, 1]])}, "durations[0, 1]"),
         ({"durations": torch.tensor([[1.0, torch.inf], [1, 1]])}, "durations[0, 1]"),
-        ({"durations": torch.ones(2)}, "durations: shape"),
+        ({"durations": torch.ones(2)}, "`durations` must have shape"),
         ({"condition": torch.tensor([0.5, 1])}, "condition"),
     ):
         with refuses(words):

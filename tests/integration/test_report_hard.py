@@ -99,7 +99,7 @@ BAD = {
     "no action at all": (Plans(torch.zeros(3, 4).long(), 3, torch.zeros(3).long()), [], ("no plan has an action",)),
     "a single action": (Plans(torch.zeros(1, 1).long(), 3), [], ("at least two plans", "new.npz")),
     "one fold": (FEW, ["--folds", "1"], ("`folds` must be from 2 to 20", "got 1")),
-    "no folds": (FEW, ["--folds", "0"], ("folds", "not 0")),
+    "no folds": (FEW, ["--folds", "0"], ("folds", "got 0")),
     "more folds than plans": (FEW, ["--folds", "21"], ("folds", "20", "got 21")),
     "more folds than groups": (replace(FEW, group=torch.arange(20) % 4), ["--folds", "5"], ("2 to 4", "got 5")),
     "nothing left to score": (FEW, ["--skip", "5"], ("skip", "got 5")),
