@@ -160,12 +160,6 @@ def check_alike_named(named: Mapping[str, Sequence[str] | None], remedy: str, wh
         check_same_names(what, known[first], names, where, first, remedy)
 
 
-def check_level(level: object) -> None:
-    """Raise ValueError unless it is a level of confidence: a number above 0 and below 1."""
-    if not is_number(level) or not 0 < level < 1:
-        raise ValueError(f"`level` must be a number above 0 and below 1, such as 0.95, got {level!r}")
-
-
 def check_memory(needed: int, **arguments: object) -> None:
     """Raise ValueError, naming the arguments, where they need more memory than the machine has.
 
