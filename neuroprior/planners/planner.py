@@ -224,7 +224,8 @@ def check_objective(objective: str, discount: float) -> None:
 def random_best(score: Tensor, generator: torch.Generator, allowed: Tensor | None = None) -> Tensor:
     """The index `[B]` of the highest score in each row of `score [B, P]`; among equal ones a uniform draw.
 
-    All planners break their ties here.
+    Planners of whole plans break the ties between their best ones here; trees choose among actions in
+    `compiled_mcts.descend`, and those that keep several candidates in `random_top`.
 
     Args:
         score: `[B, P]`.

@@ -39,6 +39,22 @@ KINDS = {
 MARKOV = ["#1f9db3", "#2a94cf", "#2f89d6", "#3079d8", "#3a69d6", "#4360d4", "#4659cf"]
 """The colours of Markov chains of order 0, 1, 2 and so on; the last for all higher ones."""
 
+STRIPS = [
+    "#3b82d6",
+    "#e08a1e",
+    "#2fa35f",
+    "#cf4a4a",
+    "#8e6bd1",
+    "#b8a42a",
+    "#d773b0",
+    "#29a3a3",
+    "#8f5f42",
+    "#93c94e",
+    "#4b4fb8",
+    "#8d97a8",
+]
+"""Colours of actions in strips; of more actions, the most frequent ones have a colour and the others a common grey."""
+
 SPARE = ["#1f9797", "#c8579a", "#7f8f2a", "#5f7fa8", "#3079d8"]
 """Colours of what is no kind of model, in turn."""
 

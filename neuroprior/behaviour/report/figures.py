@@ -23,6 +23,7 @@ from neuroprior.behaviour.report.drawing import (
     MORE,
     PLAIN,
     SPARE,
+    STRIPS,
     WIDTH,
     Array,
     at_edges,
@@ -53,22 +54,6 @@ MOST_ROWS = 60  # plans of an ethogram
 MOST_BINS = 1600  # parts of the longest plan of an ethogram, each of which has the colour of one action
 NUMBERED = 8  # actions up to which the cells of a matrix hold their numbers
 MOST_NAMES = 60  # actions up to which each has its name beside the matrix; of more, every second or third one
-
-STRIPS = [
-    "#3b82d6",
-    "#e08a1e",
-    "#2fa35f",
-    "#cf4a4a",
-    "#8e6bd1",
-    "#b8a42a",
-    "#d773b0",
-    "#29a3a3",
-    "#8f5f42",
-    "#93c94e",
-    "#4b4fb8",
-    "#8d97a8",
-]
-"""Colours of actions in strips; of more actions, the most frequent ones have a colour and the others a common grey."""
 
 OTHER = "#7d838c"
 

@@ -7,9 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 
 from neuroprior import Plans
-from neuroprior.behaviour.report.drawing import FEWER, KINDS, MARKOV, MORE, SPARE, colors, lines
+from neuroprior.behaviour.report.drawing import FEWER, KINDS, MARKOV, MORE, SPARE, STRIPS, colors, lines
 from neuroprior.behaviour.report.figures import (
-    STRIPS,
     condition_figure,
     drift_figure,
     dwell_figure,

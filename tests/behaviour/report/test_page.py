@@ -15,10 +15,9 @@ from hypothesis import strategies as st
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
-from neuroprior.behaviour.report.drawing import FEWER, KINDS, MARKOV, MORE, SPARE, drawn, short
+from neuroprior.behaviour.report.drawing import FEWER, KINDS, MARKOV, MORE, SPARE, STRIPS, drawn, short
 from neuroprior.behaviour.report.figures import (
     MOST_BINS,
-    STRIPS,
     drift_figure,
     dwell_figure,
     ethogram_figure,
