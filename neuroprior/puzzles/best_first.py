@@ -85,7 +85,7 @@ class BestFirstPlanner(Planner):
     steps_at_once = 2**20
 
     order: tuple[int, float] | None = None
-    """For the compiled loop, the kind of order and the weight of the heuristic; None: it does not know `cost`."""
+    """The kind of order and the weight of the heuristic in the compiled loop, or None where it does not know `cost`."""
 
     reroot = False
     """Whether nodes nearer to the goal than all before them on their path are new roots, see `LevinPlanner`."""
