@@ -119,6 +119,17 @@ def test_links(page: Path) -> None:
         assert not anchor or anchor in anchors(target), link
 
 
+@pytest.mark.parametrize("page", SITE, ids=name)
+def test_what_a_page_includes_is_there(page: Path) -> None:
+    for include in re.findall(r"^```\{include\} (.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL):
+        file, *options = include.splitlines()
+        text = (page.parent / file).read_text(encoding="utf-8")
+        for marker in (
+            option.split(": ", 1)[1].strip('"') for option in options if "start-" in option or "end-" in option
+        ):
+            assert marker in text, marker
+
+
 def test_every_picture_is_shown() -> None:
     text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
     assert not [path.name for path in (ROOT / "docs").glob("*.png") if f"{path.name})" not in text]
