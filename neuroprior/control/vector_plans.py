@@ -8,7 +8,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_range, check_single_precision, check_sizes, is_integer
 from neuroprior.plans.columns import check_distinct
-from neuroprior.plans.sequences import Sequences, check_index, expand_context
+from neuroprior.plans.sequences import Sequences, expand_context
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -90,21 +90,6 @@ class VectorPlans(Sequences):
     def action_size(self) -> int:
         """The number of dimensions of an action, D."""
         return int(self.actions.shape[2])
-
-    def __getitem__(self, index: Tensor | slice) -> "VectorPlans":
-        """The plans at `index` (a slice, integers or a bool mask), as `VectorPlans`."""
-        check_index(index)
-
-        def pick(values: Tensor | None) -> Tensor | None:
-            return None if values is None else values[index]
-
-        return replace(
-            self,
-            actions=self.actions[index],
-            lengths=pick(self.lengths),
-            context=pick(self.context),
-            group=pick(self.group),
-        )
 
     def without_context(self) -> "VectorPlans":
         """The same plans without their context."""

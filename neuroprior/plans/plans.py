@@ -13,7 +13,7 @@ from torch.nn import functional
 from neuroprior._checks import check_count, check_memory, check_range, check_sizes, is_integer
 from neuroprior.plans.columns import Columns, Missing, check_distinct, fields_of_events
 from neuroprior.plans.rows import check_readable, rows_of
-from neuroprior.plans.sequences import Sequences, check_index, expand_context
+from neuroprior.plans.sequences import Sequences, expand_context
 
 MOST_BITS = 48
 """The most binary digits of the number of plans that `all_plans` lists, on any machine."""
@@ -166,29 +166,11 @@ class Plans(Sequences):
         taken = super().mask()
         return taken if end or self.end is None else taken & (self.actions != self.end)
 
-    def __getitem__(self, index: Tensor | slice) -> "Plans":
-        """The plans at `index` (a slice, integers or a bool mask), as `Plans`."""
-        check_index(index)
-
-        def pick(values: Tensor | None) -> Tensor | None:
-            return None if values is None else values[index]
-
-        return replace(
-            self,
-            actions=self.actions[index],
-            lengths=pick(self.lengths),
-            context=pick(self.context),
-            group=pick(self.group),
-            durations=pick(self.durations),
-            condition=pick(self.condition),
-            plan_names=None if self.plan_names is None else self._names_at(self.plan_names, index),
-        )
-
-    def _names_at(self, names: Sequence[str], index: Tensor | slice) -> tuple[str, ...]:
-        if isinstance(index, slice):
-            return tuple(names[index])
-        chosen = torch.as_tensor(index).cpu()
-        return tuple(names[i] for i in torch.arange(len(self))[chosen].tolist())
+    def _names_of(self, index: Tensor | slice) -> dict[str, Any]:
+        if self.plan_names is None:
+            return {}
+        chosen = index if isinstance(index, slice) else torch.as_tensor(index).cpu()
+        return {"plan_names": tuple(self.plan_names[i] for i in torch.arange(len(self))[chosen].tolist())}
 
     @classmethod
     def from_dataframe(

@@ -1,17 +1,20 @@
 """What plans of numbered actions and plans of vectors have in common: they are split into training and validation."""
 
 import hashlib
-from abc import ABC, abstractmethod
+from abc import ABC
 from collections.abc import Iterator
 from dataclasses import replace
 from numbers import Integral, Real
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 from neuroprior._checks import check_count, is_integer, is_number
 from neuroprior._random import generator_on
+
+PER_PLAN = ("actions", "lengths", "context", "group", "durations", "condition")
+"""Fields whose tensors have a row for each plan."""
 
 
 def check_index(index: object) -> None:
@@ -70,9 +73,16 @@ class Sequences(ABC):
             return self
         return replace(self, **moved)  # type: ignore[type-var]
 
-    @abstractmethod
     def __getitem__(self, index: Tensor | slice) -> Self:
         """The plans at `index` (a slice, integers or a bool mask)."""
+        check_index(index)
+        tensors = {name: getattr(self, name, None) for name in PER_PLAN}
+        picked = {name: values[index] for name, values in tensors.items() if values is not None}
+        return replace(self, **picked, **self._names_of(index))  # type: ignore[type-var]
+
+    def _names_of(self, index: Tensor | slice) -> dict[str, Any]:
+        """The fields of the plans at `index` that are no tensors, where each plan has its own."""
+        return {}
 
     def __iter__(self) -> Iterator[Self]:
         """Each plan, as plans of one."""

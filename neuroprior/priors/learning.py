@@ -19,11 +19,11 @@ def training_plans(prior: Prior, plans: Plans | Tensor, *, further: bool = False
         ValueError: another number of actions, other names than those from which it learns further, or a context of
             another kind than the prior takes.
     """
-    plans = prior.as_plans(plans)
+    plans = _as_taken(prior, plans)
     check_actions(prior, plans)
     known = prior.action_names if further else None
     check_same_names("action_names", known, plans.action_names, "the plans", "this prior, which learns further")
-    plans = validation_plans(prior, plans)
+    prior.check_context_of(plans)
     prior.end, prior.has_learned = plans.end, True
     prior.action_names = known if plans.action_names is None else tuple(plans.action_names)
     prior.context_names = None
@@ -42,10 +42,8 @@ def validation_plans(prior: Prior, plans: Plans | Tensor) -> Plans:
     Raises:
         ValueError: another number of actions, or a context of another kind than the prior takes.
     """
-    plans = prior.as_plans(plans)
+    plans = _as_taken(prior, plans)
     check_actions(prior, plans)
-    if not prior.takes_context:
-        return plans.without_context()
     prior.check_context_of(plans)
     return plans
 
@@ -56,8 +54,7 @@ def known_plans(prior: Prior, plans: Plans | Tensor) -> Plans:
     Raises:
         ValueError: another number of actions, other names, a context of another kind, or no action at all.
     """
-    plans = prior.as_plans(plans)
-    plans = plans if prior.takes_context else plans.without_context()
+    plans = _as_taken(prior, plans)
     prior.check_plans(plans)
     if not bool(plans.mask().any()):
         raise ValueError("`plans` must have at least one plan with an action")
@@ -78,3 +75,9 @@ def counted_plans(prior: Prior, plans: Plans | Tensor) -> Plans:
     if plans.end != prior.end:
         raise ValueError(f"`plans` must have end={prior.end}, as those it learned from, got {plans.end}")
     return plans
+
+
+def _as_taken(prior: Prior, plans: Plans | Tensor) -> Plans:
+    """`plans` as `Plans`, without a context that the prior does not take."""
+    plans = prior.as_plans(plans)
+    return plans if prior.takes_context else plans.without_context()

@@ -324,7 +324,7 @@ class NeuralPrior(Prior):
         how = Settings(**settings)
         if isinstance(how.validation, Plans):  # refused before anything is kept of the plans
             validation = validation_plans(self, how.validation)
-            check_alike(validation_plans(self, self.as_plans(plans)), validation)
+            check_alike(validation_plans(self, plans), validation)
             how = replace(how, validation=validation)
         plans = self.prepare(plans, how.window)
         train(self, plans, how, draw_seed(generator_on(generator, "cpu")))
