@@ -121,7 +121,7 @@ def check_saved(folders: Sequence[str], worlds: Sequence[str]) -> None:
             if prior.takes_context:
                 if world not in observations:
                     held_out = task.worlds(0).held_out
-                    observations[world] = held_out.observe(held_out.reset(1, torch.Generator().manual_seed(0)))
+                    observations[world] = held_out.context(held_out.reset(1, torch.Generator().manual_seed(0)))
                 try:
                     prior.check_context_of(observations[world], 1)
                 except ValueError as error:

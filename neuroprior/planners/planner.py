@@ -3,7 +3,8 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Literal, NamedTuple, TypedDict, Unpack
+from copy import copy
+from typing import Literal, NamedTuple, Self, TypedDict, Unpack
 
 import torch
 from torch import Tensor
@@ -41,8 +42,8 @@ class Decision(NamedTuple):
 class Objective(TypedDict, total=False):
     """What a planner optimises, as keyword arguments; see `Planner`."""
 
-    objective: Literal["terminal", "return"]
-    discount: float
+    objective: Literal["terminal", "return"] | None
+    discount: float | None
     value: Callable[[Tensor], Tensor] | None
     any_prefix: bool
 
@@ -52,8 +53,9 @@ class Planner(ABC):
 
     Args:
         objective: "terminal": the score of a plan is the reward of its last step (Hyvärinen, both simulations).
-            "return": the sum of its rewards, that of step t (from 0) times `discount ** t`.
-        discount: above 0, at most 1; only for "return".
+            "return": the sum of its rewards, that of step t (from 0) times `discount ** t`. None: what the world
+            declares, see `World.objective`.
+        discount: above 0, at most 1; only for "return". None: that of the world.
         value: its value of the final state is added to the score: a function from final states `[N, ...]` to `[N]`;
             with "return" it is multiplied by `discount ** L`.
         any_prefix: the agent may stop after any action but none at all: the score of a plan is that of its best prefix,
@@ -70,8 +72,8 @@ class Planner(ABC):
 
     def __init__(
         self,
-        objective: Literal["terminal", "return"] = "terminal",
-        discount: float = 1.0,
+        objective: Literal["terminal", "return"] | None = None,
+        discount: float | None = None,
         value: Callable[[Tensor], Tensor] | None = None,
         any_prefix: bool = False,
     ) -> None:
@@ -91,6 +93,15 @@ class Planner(ABC):
             "any_prefix": self.any_prefix,
         }
 
+    def for_world(self, world: World) -> Self:
+        """Returns this planner with the objective and discount of `world` where it has none of its own.
+
+        `plan` begins with it, since scores need to know what counts.
+        """
+        planner = copy(self)
+        planner.objective, planner.discount = settle_objective(world, self.objective, self.discount)
+        return planner
+
     @abstractmethod
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
         """Plan from each of B starts.
@@ -106,18 +117,19 @@ class Planner(ABC):
 
     def score(self, rewards: Tensor, final_state: Tensor) -> Tensor:
         """The scores `[...]` of plans with `rewards [..., L]` that end in `final_state` (`[...]` and its own shape)."""
-        length, rewards = rewards.shape[-1], as_floats(rewards)
-        if self.objective == "terminal":
+        rewards = as_floats(rewards)
+        if self._counts_last():
             return self._add_value(rewards[..., -1], final_state)
-        return self._add_value((rewards * self._weights(rewards)).sum(-1), final_state, self.discount**length)
+        weights = self.discounts(rewards)
+        return self._add_value((rewards * weights[:-1]).sum(-1), final_state, weights[-1])
 
     def prefix_scores(self, rewards: Tensor, states: Tensor) -> Tensor:
         """The scores `[..., L]` of all prefixes of plans that have `rewards [..., L]` and lead to `states [..., L]`."""
         rewards = as_floats(rewards)
-        if self.objective == "terminal":
+        if self._counts_last():
             return self._add_value(rewards, states)
-        weights = self._weights(rewards)
-        return self._add_value((rewards * weights).cumsum(-1), states, self.discount * weights)
+        weights = self.discounts(rewards)
+        return self._add_value((rewards * weights[:-1]).cumsum(-1), states, weights[1:])
 
     def score_rollout(self, rollout: Rollout) -> tuple[Tensor, Tensor]:
         """Scores and final states for `decide`: of all prefixes where the rollout has states, else of plans."""
@@ -139,8 +151,16 @@ class Planner(ABC):
         parts: tuple[Tensor, ...] = state.split(max(at_once // max(steps, 1), 1))
         return parts
 
-    def _weights(self, rewards: Tensor) -> Tensor:
-        return self.discount ** torch.arange(rewards.shape[-1], device=rewards.device, dtype=rewards.dtype)
+    def discounts(self, rewards: Tensor) -> Tensor:
+        """The weights in a return, `[L + 1]`: those of `rewards [..., L]`, and that of the final state's value."""
+        steps = torch.arange(rewards.shape[-1] + 1, device=rewards.device, dtype=rewards.dtype)
+        return (1.0 if self.discount is None else self.discount) ** steps
+
+    def _counts_last(self) -> bool:
+        """Whether the last of the rewards is the score."""
+        if self.objective is None:
+            raise ValueError("objective: it is the world's; score with `planner.for_world(world)`")
+        return self.objective == "terminal"
 
     def _add_value(self, score: Tensor, state: Tensor, weight: Tensor | float = 1.0) -> Tensor:
         """`score [...]` plus the weighted value of `state` (`[...]` and its own shape)."""
@@ -180,10 +200,14 @@ class PriorPlanner(Planner):
         """As `Stepper.threads_for`, but all threads where a value of the user's may be worth them."""
         return nullcontext() if self.value is not None else Stepper(self.prior).threads_for(num_plans)
 
-    def _check(self, world: World, state: Tensor, generator: torch.Generator | None) -> torch.Generator:
-        """Raise ValueError unless the prior can act in the world from `state`; the generator to draw with."""
+    def _prepare(self, world: World, state: Tensor, generator: torch.Generator | None) -> tuple[Self, torch.Generator]:
+        """Returns the planner for the world, and the generator to draw with.
+
+        Raises:
+            ValueError: the prior cannot act in the world from `state`.
+        """
         check_in_world(self.prior, world, state)
-        return generator_on(generator, state.device)
+        return self.for_world(world), generator_on(generator, state.device)
 
 
 def as_floats(rewards: Tensor) -> Tensor:
@@ -211,13 +235,28 @@ def value_of(value: Callable[[Tensor], Tensor], state: Tensor, name: str = "valu
     return values.view(-1)
 
 
-def check_objective(objective: str, discount: float) -> None:
+def settle_objective(
+    world: World, objective: Literal["terminal", "return"] | None, discount: float | None
+) -> tuple[Literal["terminal", "return"], float]:
+    """Returns the objective and the discount: those of `world` where they are None.
+
+    Raises:
+        ValueError: they are out of range, or the discount has no effect.
+    """
+    settled = world.objective if objective is None else objective
+    if discount is None:
+        discount = world.discount if settled == "return" else 1.0
+    check_objective(settled, discount)
+    return settled, discount
+
+
+def check_objective(objective: str | None, discount: float | None) -> None:
     """Raise ValueError for an unknown `objective`, or a `discount` that is out of range or has no effect."""
-    if objective not in ("terminal", "return"):
+    if objective not in (None, "terminal", "return"):
         raise ValueError(f'`objective` must be "terminal" or "return", got {objective!r}')
-    if not is_number(discount) or not 0 < discount <= 1:
+    if discount is not None and (not is_number(discount) or not 0 < discount <= 1):
         raise ValueError(f"`discount` must be a number above 0 and at most 1, got {discount!r}")
-    if objective == "terminal" and discount != 1:
+    if objective == "terminal" and discount not in (None, 1):
         raise ValueError('discount: it has no effect with objective="terminal"; use objective="return"')
 
 
@@ -242,8 +281,8 @@ def random_best(score: Tensor, generator: torch.Generator, allowed: Tensor | Non
     allowed = None if allowed is None else allowed.expand(score.shape)
     if allowed is not None and not allowed.any(1).all():
         raise ValueError(
-            "plans: from some start there is no plan of legal actions alone; a world's `legal_actions` are at least one"
-            " in each state, and a prior's probability is not 0 for all of these"
+            "plans: from some start there is no plan of legal actions alone, to which the prior gives a probability"
+            " above 0"
         )
     # Scores are often one column of many, which is slow to read more than once.
     score = score.contiguous() if allowed is None else score.masked_fill(~allowed, -torch.inf)

@@ -65,7 +65,7 @@ class SamplingPlanner(PriorPlanner):
         self.num_rollouts, self.halving, self.uniform_share = num_rollouts, halving, uniform_share
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
-        generator = self._check(world, state, generator)
+        _, generator = self._prepare(world, state, generator)
         steps = self.model_steps(world)
         chunks = self.chunks(state, steps)
         decisions = (decide(*self.candidates(world, some, generator), steps, generator) for some in chunks)
@@ -120,7 +120,7 @@ class SamplingPlanner(PriorPlanner):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The plans, their scores and final states in a deterministic world."""
         if rollout is not None:
-            return plans, *self.score_rollout(rollout)
+            return plans, *self.for_world(world).score_rollout(rollout)
         return plans, *mean_scores(self, world, state, plans, self.num_rollouts, generator)
 
     def model_steps(self, world: World) -> int:

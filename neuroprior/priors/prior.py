@@ -149,6 +149,9 @@ class Prior(SavedModule):
 
         Returns:
             Logits `[N, A]` of the first action, and the state of N plans.
+
+        Raises:
+            ValueError: a context that the prior does not know, or none where it takes one.
         """
 
     @abstractmethod
@@ -162,6 +165,9 @@ class Prior(SavedModule):
 
         Returns:
             Logits `[N, A]` of the next action, and the next state.
+
+        Raises:
+            ValueError: an action or a context that the prior does not know.
         """
 
     def advance(self, action: Tensor, state: Any, context: Tensor | None = None, room: int = 0) -> tuple[Tensor, Any]:
@@ -349,6 +355,16 @@ class Prior(SavedModule):
                 f"`context` must be floating point features of size {self.context_size},"
                 f" got {str(context.dtype).removeprefix('torch.')} of shape {list(context.shape)}"
             )
+
+    def check_start(self, batch_size: int, context: Tensor | None) -> None:
+        """Raise ValueError unless `start` can be given this context; implementations of `start` begin with it."""
+        self.check_context_of(context, batch_size)
+
+    def check_step(self, action: Tensor, context: Tensor | None) -> None:
+        """Raise ValueError unless `step` can be given these; implementations of `step` begin with it."""
+        check_range("action", action, self.num_actions, "actions")
+        if context is not None:
+            self.check_context_of(context, len(action))
 
     def check_settings(self, settings: Mapping[str, Any]) -> None:
         """Raise ValueError unless `fit` takes all of these settings."""

@@ -21,7 +21,7 @@ from neuroprior.sampling.draws import (
 from neuroprior.sampling.prefixes import Prefixes
 from neuroprior.sampling.states import State, numbers_in, select_rows
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
-from neuroprior.worlds.world import Rollout, World, join_states
+from neuroprior.worlds.world import Rollout, World, join_states, step_alive
 
 CACHED, FEWEST = 2**19, 1024
 """On a CPU, plans are stepped in parts of at most `CACHED` numbers in their states (or logits), so that they fit a
@@ -186,7 +186,7 @@ def _sample_in_world(
         counts = children[row, action]
         root, hidden, now = _taken(row, root, hidden, now)
         begun = [_taken(row, *column) for column in begun]
-        now, reward = world.step(now, action, generator)
+        now, reward = step_alive(world, now, action, generator)
         for column, values in zip(begun, (action.to(draw.dtype), reward, now), strict=True):
             column.append(values)
         if not keep_states:
@@ -211,7 +211,7 @@ def _sample_in_world(
             parent, last = plans.extend(action)
             if parent is not None:
                 here, memory = _taken(parent, here, memory)
-            here, reward = world.step(here, last, generator)
+            here, reward = step_alive(world, here, last, generator)
             own[0].append(action.to(draw.dtype))
             own[1].append(plans.of_each(reward))
             if keep_states:

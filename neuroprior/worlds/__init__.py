@@ -6,12 +6,16 @@ from neuroprior.worlds.grid import GridWorld, egocentric, goal_direction, gridwo
 from neuroprior.worlds.gymnasium import SteppedWorld, from_gymnasium
 from neuroprior.worlds.labyrinth import labyrinth
 from neuroprior.worlds.mazes import four_rooms, maze
+from neuroprior.worlds.observations import Categories, Features, Patterns
 from neuroprior.worlds.tabular import TabularWorld
 from neuroprior.worlds.world import Rollout, World
 
 __all__ = [
+    "Categories",
     "EpisodicWorld",
+    "Features",
     "GridWorld",
+    "Patterns",
     "PocketCube",
     "Rollout",
     "SteppedWorld",

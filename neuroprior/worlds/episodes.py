@@ -7,11 +7,14 @@ from torch import Tensor
 
 from neuroprior._checks import check_count
 from neuroprior._random import generator_on
+from neuroprior.worlds.observations import Features
 from neuroprior.worlds.tabular import TabularWorld
 
 
 class EpisodicWorld(TabularWorld):
     """A `TabularWorld` with start states, absorbing terminal states, and any number of disjoint layouts.
+
+    Its objective is "return", as that of the environments it is made from.
 
     Args:
         next_state, reward, action_names, probability: see `TabularWorld`.
@@ -36,6 +39,8 @@ class EpisodicWorld(TabularWorld):
         [False, True]
     """
 
+    objective = "return"
+
     def __init__(
         self,
         next_state: Tensor,
@@ -58,6 +63,8 @@ class EpisodicWorld(TabularWorld):
         if not (self.next_state[here].flatten(1) == here[:, None]).all():
             raise ValueError("ended: every action must stay where an episode has ended")
         self.starts, self.ended, self.features = starts, ended, features
+        if features is not None:
+            self.observation = Features(features.shape[1])
         self._layouts = torch.zeros_like(ended, dtype=torch.long) if layouts is None else layouts.long()
         self.num_layouts = int(self._layouts.max()) + 1
         self._goals = self._entered_with_reward()

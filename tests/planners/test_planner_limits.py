@@ -72,9 +72,20 @@ class DeadEnd(Walk):
 
 
 @PLANNERS
-def test_a_start_without_any_legal_plan_is_refused(make):
-    with pytest.raises(ValueError, match="legal"):
-        make().plan(DeadEnd(torch.float), torch.tensor([[0.0, 0.0], [3.0, 0.0]]))
+def test_a_state_without_any_legal_action_is_an_end(make):
+    """The reward is 1 in each step that ends right of 0; from (3, 0) there is none to take, and nothing to gain."""
+    world, start = DeadEnd(torch.float), torch.tensor([[0.0, 0.0], [3.0, 0.0], [1.5, 1.0]])
+    decision = make(objective="return").plan(world, start, torch.Generator().manual_seed(0))
+    states, total = start, torch.zeros(3)
+    for action in decision.plan.T:
+        alive = states[:, 0] < 2
+        after, reward = world.step(states, action.long())
+        states, total = torch.where(alive[:, None], after, states), total + reward * alive
+    assert decision.score.equal(total)
+    assert decision.final_state.equal(states)
+    assert decision.score[1] == 0
+    assert decision.final_state[1].equal(start[1])
+    assert decision.score[2] > 0
 
 
 @pytest.mark.parametrize(

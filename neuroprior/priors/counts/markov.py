@@ -11,7 +11,7 @@ from neuroprior._checks import check_count, is_number
 from neuroprior.plans import Plans
 from neuroprior.priors.counts.histories import Counts, Tree, level_bounds, parent_rows, row_blocks
 from neuroprior.priors.counts.history_prior import HistoryPrior
-from neuroprior.priors.learning import training_plans
+from neuroprior.priors.learning import plans_for, training_plans
 
 Backoff = Literal["dirichlet", "witten-bell", "kneser-ney"]
 
@@ -245,7 +245,7 @@ class Chains:
         made = MarkovPrior(
             self.plans.num_actions, self.order, smoothing, num_contexts=self.num_contexts, backoff=backoff
         )
-        training_plans(made, self.plans)
+        training_plans(made, plans_for(made, self.plans))
         made.learn(*self._counted)
         return made
 

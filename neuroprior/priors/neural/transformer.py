@@ -170,6 +170,7 @@ class TransformerPrior(NeuralPrior):
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         if not self.writes_in_place(state):
             return super().step(action, state, context)
+        self.check_step(action, context)
         return self._step_in_place(action, state, context)
 
     def advance(

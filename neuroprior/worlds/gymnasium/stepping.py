@@ -11,6 +11,7 @@ from neuroprior._checks import check_count, check_range, is_integer
 from neuroprior._random import generator_on
 from neuroprior.worlds.gymnasium.environment import RUNNING, Episode, Transition, action_names, stacked
 from neuroprior.worlds.gymnasium.states import exact_copier, nondeterminism
+from neuroprior.worlds.observations import Features
 from neuroprior.worlds.world import Rollout, World, check_plans, on_cpu
 
 _SEED, _LENGTH, _ENDED, _ACTIONS = 0, 1, 2, 3
@@ -62,6 +63,7 @@ class SteppedWorld(World):
         self._copier = exact_copier(self._episode, seeds[0])
         self.copies = self._copier is not None
         self._env = env
+        self.observation = Features(len(self._episode.reset(seeds[0])))
         self._at: tuple[int, ...] = ()  # the history at whose end the environment is; () where that is not known
         self._kept: OrderedDict[tuple[int, ...], _Kept] = OrderedDict()
 
