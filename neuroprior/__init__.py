@@ -15,6 +15,7 @@ from neuroprior._version import __version__
 if TYPE_CHECKING:
     from neuroprior.planners import (
         ExhaustivePlanner,
+        FrontierPlanner,
         MCTSPlanner,
         Planner,
         SamplingPlanner,
@@ -41,6 +42,7 @@ __all__ = [
     "CombinedPrior",
     "ContextTreePrior",
     "ExhaustivePlanner",
+    "FrontierPlanner",
     "GRUPrior",
     "MCTSPlanner",
     "MarkovPrior",

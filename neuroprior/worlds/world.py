@@ -56,7 +56,8 @@ class World(ABC):
 
     Attributes:
         num_actions: the number of actions, A.
-        all_legal: True where every action is legal in every state, so that `legal_actions` need not be called.
+        all_legal: True where every action is legal in every state, so that `legal_actions` need not be called. A class
+            that writes `legal_actions`, and says nothing of this, has False.
         stochastic: True where the outcome of an action is random, so that one rollout of a plan is not enough.
         shares_steps: True where steps from different states may be taken on several threads at once.
         observation: what `observe` gives: `Categories(number)`, `Features(size)`, or None where nothing is observed.
@@ -76,6 +77,11 @@ class World(ABC):
     objective: Literal["terminal", "return"] = "return"
     discount: float = 1.0
     action_names: tuple[str, ...] | None = None
+
+    def __init_subclass__(cls, **settings: object) -> None:
+        super().__init_subclass__(**settings)
+        if "legal_actions" in vars(cls) and "all_legal" not in vars(cls):
+            cls.all_legal = False
 
     def to(self, device: torch.device | str) -> Self:
         """Move the tensors of this world, and of worlds that it holds, to `device`; returns self."""

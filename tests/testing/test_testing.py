@@ -396,6 +396,8 @@ class KeepsStarts(Line):
 
 
 class Unsaid(Line):
+    all_legal = True
+
     def legal_actions(self, state: Tensor) -> Tensor:
         return torch.tensor([True, False]).expand(len(state), 2)
 

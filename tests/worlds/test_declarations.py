@@ -4,7 +4,6 @@ import warnings
 
 import pytest
 import torch
-from tests.support.sources import seeded
 from torch import Tensor
 
 from neuroprior import (
@@ -22,6 +21,7 @@ from neuroprior import (
 )
 from neuroprior.planners import FrontierPlanner
 from neuroprior.worlds import Categories, Features, TabularWorld
+from tests.support.sources import seeded
 
 
 def three_ways() -> TabularWorld:
@@ -121,9 +121,9 @@ def test_integers_that_are_features_become_floating_point():
 @pytest.mark.parametrize(
     ("observation", "observe", "message"),
     [
-        (Features(3), lambda self, state: state, r"must give \[\d, 3\], as the world declares Features\(size=3\)"),
-        (Features(2), lambda self, state: state[:, 0], r"got torch.int64 \[\d\]"),
-        (Categories(9), lambda self, state: state[:, 0].float(), r"must give integers of shape \[\d\]"),
+        (Features(3), lambda self, state: state, r"must give \[10, 3\], as the world declares Features\(size=3\)"),
+        (Features(2), lambda self, state: state[:, 0], r"got torch.int64 \[10\]"),
+        (Categories(9), lambda self, state: state[:, 0].float(), r"must give integers of shape \[10\]"),
         (Categories(9), lambda self, state: state[:, 0] + 9, r"out of range: there are 9 categories"),
         (Categories(9), lambda self, state: None, r"got NoneType"),
     ],

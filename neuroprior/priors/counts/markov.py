@@ -215,9 +215,10 @@ class Chains:
     """
 
     def __init__(self, plans: Plans, order: int, num_contexts: int | None = None) -> None:
-        self.plans, self.order, self.num_contexts = plans, order, num_contexts
+        self.order, self.num_contexts = order, num_contexts
         self._first = MarkovPrior(plans.num_actions, order, num_contexts=num_contexts)
-        self._counted = self._first.count(plans)
+        self.plans = plans_for(self._first, plans)
+        self._counted = self._first.count(self.plans)
         self._first.hold(*self._counted, torch.empty(0, plans.num_actions))
 
     def log_likelihood(self, plans: Plans) -> Tensor:
@@ -245,7 +246,7 @@ class Chains:
         made = MarkovPrior(
             self.plans.num_actions, self.order, smoothing, num_contexts=self.num_contexts, backoff=backoff
         )
-        training_plans(made, plans_for(made, self.plans))
+        training_plans(made, self.plans)
         made.learn(*self._counted)
         return made
 

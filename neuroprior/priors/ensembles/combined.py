@@ -295,7 +295,7 @@ class CombinedPrior(MixturePrior):
         plans, counted = counted_plans(self, plans), []
         for e in priors_in(self.spare):
             try:
-                counted.append(e.recount(plans))
+                counted.append(e.recount(plans_for(e, plans)))
             except TooLargeError:  # it fitted before only just
                 continue
         self.spare = nn.ModuleList(counted)

@@ -180,7 +180,7 @@ class MixturePrior(Prior):
     def recount(self, plans: Plans) -> Self:
         plans = counted_plans(self, plans)
         for expert in self._experts():
-            expert.recount(plans)
+            expert.recount(plans_for(expert, plans))
         return self
 
     @torch.no_grad()

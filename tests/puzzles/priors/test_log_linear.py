@@ -218,7 +218,7 @@ def test_settings_out_of_range_are_refused_and_change_nothing(settings: dict[str
         (lambda: LogLinearPrior(2, 0), "num_patterns"),
         (lambda: LogLinearPrior(3, 2).start(1, torch.zeros(1, 2)), "`context` must be 2 patterns"),
         (lambda: LogLinearPrior(3, 2).start(1, torch.zeros(1, 3, dtype=torch.int32)), "`context` must be 2 patterns"),
-        (lambda: LogLinearPrior(3, 2).start(1), "`context` must be 2 patterns"),
+        (lambda: LogLinearPrior(3, 2).start(1), "takes a context, and none was given"),
         (
             lambda: LogLinearPrior(3, 1).fit_steps(
                 Steps(torch.zeros(2, 1, dtype=torch.int32), torch.tensor([0, 4]), torch.arange(2), torch.arange(2))
