@@ -302,6 +302,8 @@ class Prior(SavedModule):
         context: Tensor | None = None,
         *,
         past: Tensor | None = None,
+        state: tuple[Tensor, Any] | None = None,
+        mask: Tensor | sampling.Mask | None = None,
         temperature: float = 1.0,
         generator: torch.Generator | None = None,
         method: Literal["auto", "ancestral", "tree"] = "auto",
@@ -309,7 +311,8 @@ class Prior(SavedModule):
         """Independent plans `[num_plans, length]`; see `neuroprior.sampling.ancestral.sample`.
 
         After a `past` of executed actions, `[T]` or `[num_plans, T]`, plans go on from these, as a planner that replans
-        needs them.
+        needs them; with a `state`, what `start` or the last `step` returned, without reading the past again. A `mask`
+        says which actions may be drawn.
 
         `neuroprior.priors.decode(plans, prior)` gives their names.
 
@@ -322,6 +325,8 @@ class Prior(SavedModule):
             length,
             context,
             past=past,
+            state=state,
+            mask=mask,
             temperature=temperature,
             generator=generator,
             method=method,

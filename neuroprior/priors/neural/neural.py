@@ -206,6 +206,7 @@ class NeuralPrior(Prior):
             )
         self.window = None
 
+    @torch.no_grad()
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         self.check_start(batch_size, context)
         previous = torch.full((batch_size,), self.num_actions, device=self.device)
@@ -213,6 +214,7 @@ class NeuralPrior(Prior):
         logits, hidden = self.encode(inputs[:, None])
         return logits[:, 0], torch.cat([inputs, hidden], 1)
 
+    @torch.no_grad()
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         self.check_step(action, context)
         last, hidden = state[:, : self.input_size], state[:, self.input_size :]
