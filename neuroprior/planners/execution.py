@@ -130,7 +130,8 @@ def collect(
         assert num_plans is not None
         check_memory(8 * num_plans, num_plans=num_plans)
         state = world.reset(num_plans, generator)
-    plan, score, _, _, lengths = planner.plan(world, state, generator)
+    decision = planner.plan(world, state, generator)
+    plan, score, lengths = decision.plan, decision.score, decision.lengths
     _, states = _step_through(world, state, plan, generator)
     before = torch.cat([state[:, None], states[:, :-1]], 1)[:, : plan.shape[1]]
     steps = executed_steps(world, before)

@@ -8,7 +8,15 @@ from torch import Tensor
 from neuroprior._checks import check_flags
 from neuroprior._hashing import row_hashes
 from neuroprior._random import gumbel
-from neuroprior.planners.planner import Decision, Objective, PriorPlanner, as_floats, join_decisions, random_best
+from neuroprior.planners.planner import (
+    Candidates,
+    Decision,
+    Objective,
+    PriorPlanner,
+    as_floats,
+    join_decisions,
+    random_best,
+)
 from neuroprior.plans import action_dtype
 from neuroprior.sampling.states import select_rows
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
@@ -106,7 +114,12 @@ class FrontierPlanner(PriorPlanner):
             torch.stack([getattr(decision, name) for decision in found], 1)[row, best]
             for name in ("plan", "final_state")
         )
-        return Decision(plan, score[row, best], final, steps, best + 1 if self.any_prefix else None)
+        candidates = None
+        if self.keep_candidates:
+            states = front.state.view(*front.log_prob.shape, *front.state.shape[1:])
+            kept = self.score(front.rewards, states).masked_fill(front.log_prob == -torch.inf, -torch.inf)
+            candidates = Candidates(front.plans, kept)
+        return Decision(plan, score[row, best], final, steps, best + 1 if self.any_prefix else None, candidates)
 
     def _extend(
         self, world: World, front: "_Front", logits: Tensor, width: int, generator: torch.Generator

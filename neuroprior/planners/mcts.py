@@ -104,7 +104,8 @@ class MCTSPlanner(PriorPlanner):
         plans, rewards, states, done = found
         rollout = Rollout(states[:, :, -1], rewards, states if self.any_prefix else None)
         score, ends = self.score_rollout(rollout)
-        return decide(plans, score, ends, steps, generator, done[..., None] if self.any_prefix else done)
+        allowed = done[..., None] if self.any_prefix else done
+        return decide(plans, score, ends, steps, generator, allowed, self.keep_candidates)
 
 
 class _Trees:

@@ -19,6 +19,34 @@ STEPS_CACHED = 2**19
 """Simulator steps whose results stay in a CPU's cache."""
 
 
+class Candidates(NamedTuple):
+    """What a planner tried from B starts: P plans of L actions from each.
+
+    Attributes:
+        plans: `[B, P, L]`; zeros where there is none.
+        scores: `[B, P]`, with `any_prefix` those of the best prefixes; -inf: there is no such plan, or it is not legal.
+
+    Example:
+        >>> tried = Candidates(torch.tensor([[[1, 0], [1, 1], [2, 0]]]), torch.tensor([[2.0, 4.0, 1.0]]))
+        >>> tried.visits(4).tolist(), tried.values(4).tolist()
+        ([[0, 2, 1, 0]], [[nan, 3.0, 1.0, nan]])
+    """
+
+    plans: Tensor
+    scores: Tensor
+
+    def visits(self, num_actions: int) -> Tensor:
+        """How many plans begin with each action: int64 `[B, A]`. Of tree search they are a policy to learn from."""
+        counts = torch.zeros(len(self.plans), num_actions, dtype=torch.long, device=self.plans.device)
+        return counts.scatter_add_(1, self.plans[:, :, 0].long(), (self.scores > -torch.inf).long())
+
+    def values(self, num_actions: int) -> Tensor:
+        """The mean score of the plans that begin with each action: `[B, A]`; NaN where there is none."""
+        scores = self.scores.masked_fill(self.scores == -torch.inf, 0)
+        sums = scores.new_zeros(len(scores), num_actions).scatter_add_(1, self.plans[:, :, 0].long(), scores)
+        return sums / self.visits(num_actions)
+
+
 class Decision(NamedTuple):
     """What a planner decided for B starts.
 
@@ -30,6 +58,7 @@ class Decision(NamedTuple):
             world, in the first of the planner's rollouts.
         model_steps: single simulator steps taken for each start.
         lengths: `[B]`: how many actions of each plan are to be executed; None: all.
+        candidates: all that was tried, where `Planner.keep_candidates` is set; else None.
     """
 
     plan: Tensor
@@ -37,6 +66,12 @@ class Decision(NamedTuple):
     final_state: Tensor
     model_steps: int
     lengths: Tensor | None = None
+    candidates: Candidates | None = None
+
+    def __repr__(self) -> str:
+        batch, length = self.plan.shape
+        mean = f"mean score {float(self.score.double().mean()):.4g}, " if batch else ""
+        return f"Decision({batch:,} plans of {length} actions, {mean}{self.model_steps:,} model steps each)"
 
 
 class Objective(TypedDict, total=False):
@@ -63,12 +98,15 @@ class Planner(ABC):
 
     Attributes:
         steps_at_once: starts are planned for in chunks of about so many simulator steps; bounds memory.
+        keep_candidates: whether decisions hold the `Candidates`, too; of `SamplingPlanner`, `MCTSPlanner` and
+            `FrontierPlanner` (the plans of full length that it kept to the end).
 
     Raises:
         ValueError: an argument is out of range.
     """
 
     steps_at_once: int = 2**22
+    keep_candidates: bool = False
 
     def __init__(
         self,
@@ -310,6 +348,7 @@ def decide(
     model_steps: int,
     generator: torch.Generator,
     allowed: Tensor | None = None,
+    keep: bool = False,
 ) -> Decision:
     """The best of the candidates, or of their prefixes.
 
@@ -320,25 +359,30 @@ def decide(
         model_steps: simulator steps taken for each start.
         generator: breaks ties.
         allowed: bool, of the shape of `score` or broadcast to it: what may win, at least one per start; None: all.
+        keep: whether the decision holds the candidates.
     """
-    row = torch.arange(len(plans), device=plans.device)
+    row, candidates = torch.arange(len(plans), device=plans.device), None
+    if keep:
+        counting = score if allowed is None else score.masked_fill(~allowed.expand(score.shape), -torch.inf)
+        scores = counting if score.dim() == 2 else counting.amax(2)
+        candidates = Candidates(plans.masked_fill((scores == -torch.inf)[..., None], 0), scores)
     if allowed is not None:
         allowed = allowed.expand(score.shape).flatten(1)
     if score.dim() == 2:
         best = random_best(score, generator, allowed)
-        return Decision(plans[row, best], score[row, best], ends[row, best], model_steps)
+        return Decision(plans[row, best], score[row, best], ends[row, best], model_steps, None, candidates)
     length = plans.shape[2]
     score = score.flatten(1)
     chosen = random_best(score, generator, allowed)
     best, last = chosen.div(length, rounding_mode="floor"), chosen % length
     beyond = torch.arange(length, device=plans.device) > last[:, None]
     plan = plans[row, best].masked_fill(beyond, 0)
-    return Decision(plan, score[row, chosen], ends[row, best, last], model_steps, last + 1)
+    return Decision(plan, score[row, chosen], ends[row, best, last], model_steps, last + 1, candidates)
 
 
 def join_decisions(parts: Iterable[Decision], batch_size: int) -> Decision:
     """The decisions for chunks of `batch_size` starts as one; its model steps are the most of any chunk."""
-    whole, at, steps = None, 0, 0
+    whole, at, steps, kept = None, 0, 0, list[Candidates]()
     for part in parts:
         if len(part.plan) == batch_size:
             return part
@@ -347,9 +391,20 @@ def join_decisions(parts: Iterable[Decision], batch_size: int) -> Decision:
             plan, score, final_state = (values.new_empty(batch_size, *values.shape[1:]) for values in part[:3])
             lengths = None if part.lengths is None else part.lengths.new_empty(batch_size)
             whole = Decision(plan, score, final_state, 0, lengths)
+        if part.candidates is not None:
+            kept.append(part.candidates)
         for result, values in zip((*whole[:3], whole.lengths), (*part[:3], part.lengths), strict=True):
             if isinstance(result, Tensor) and isinstance(values, Tensor):
                 result[at : at + len(part.plan)] = values
         at, steps = at + len(part.plan), max(steps, part.model_steps)
     assert whole is not None
-    return whole._replace(model_steps=steps)
+    return whole._replace(model_steps=steps, candidates=_join_candidates(kept) if kept else None)
+
+
+def _join_candidates(parts: list[Candidates]) -> Candidates:
+    """The candidates for chunks of starts as one; where there are fewer, -inf says that there is no plan."""
+    most = max(part.scores.shape[1] for part in parts)
+    pad = torch.nn.functional.pad
+    plans = [pad(part.plans, (0, 0, 0, most - part.plans.shape[1])) for part in parts]
+    scores = [pad(part.scores, (0, most - part.scores.shape[1]), value=-torch.inf) for part in parts]
+    return Candidates(torch.cat(plans), torch.cat(scores))

@@ -68,7 +68,10 @@ class SamplingPlanner(PriorPlanner):
         _, generator = self._prepare(world, state, generator)
         steps = self.model_steps(world)
         chunks = self.chunks(state, steps)
-        decisions = (decide(*self.candidates(world, some, generator), steps, generator) for some in chunks)
+        decisions = (
+            decide(*self.candidates(world, some, generator), steps, generator, keep=self.keep_candidates)
+            for some in chunks
+        )
         return join_decisions(decisions, len(state))
 
     def candidates(self, world: World, state: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
