@@ -9,6 +9,7 @@ from neuroprior.planners.mcts import MCTSPlanner
 from neuroprior.planners.planner import Candidates, Decision, Planner, PriorPlanner, random_best
 from neuroprior.planners.rollouts import mean_scores
 from neuroprior.planners.sampling import SamplingPlanner
+from neuroprior.planners.sources import Sources
 from neuroprior.planners.tuning import Tuned, best_sampling, proposers, search_weights
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "Planner",
     "PriorPlanner",
     "SamplingPlanner",
+    "Sources",
     "Tuned",
     "best_sampling",
     "collect",
