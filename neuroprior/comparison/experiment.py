@@ -128,7 +128,7 @@ def compare(
     numbers = [draw_seed(generator) for _ in range(seeds)]
     jobs = jobs or os.cpu_count() or 1
     with Progress(progress) as printer:
-        printer.print(f"{len(names)} planners, {len(sources)} priors, {len(design.budgets)} budgets; timing the world")
+        printer.print(f"priors {', '.join(sources)}; planners {', '.join(names)}")
         if seconds is not None:
             design, cuts = _fit(design, seconds * jobs, starts, training_starts)
             notes += cuts
