@@ -33,8 +33,14 @@ DEFAULT_LENGTH = 10
 DEFAULT_STARTS, DEFAULT_TRAINING_STARTS = 50, 500
 """Starts of a seed, if the world is fast enough."""
 
+DEFAULT_TRAINING_BUDGET = 256
+"""Plans that are tried from each training start, or as many as the largest budget."""
+
 WORKER_SECONDS = 10.0
 """Work that takes less than this is not worth starting processes for."""
+
+PROCESS_SECONDS = 5.0
+"""About how long a process takes to start."""
 
 SAFETY = 1.5
 """Seeds that are run side by side may take so many times as long as the first."""
@@ -50,7 +56,7 @@ def compare(
     length: int | None = None,
     starts: int | None = None,
     training_starts: int | None = None,
-    seeds: int = 10,
+    seeds: int = 12,
     seconds: float | None = 120.0,
     jobs: int | None = None,
     progress: bool = True,
@@ -65,8 +71,10 @@ def compare(
     the sum of rewards. Priors get the world's observations as context if it declares an `observation`.
 
     What is independent is the seed: starts and priors are drawn anew in each, and all priors and planners share them.
-    So each seed gives one number, the mean over its starts, and intervals and paired tests are Student's over seeds.
-    With one seed they are over starts, and how much a prior varies from training to training is not in them.
+    So each seed counts once, with the means over its starts. A score is the ratio of two sums over seeds: what was
+    gained over random plans, and what could be. Its interval and the paired test against uniform plans are Student's,
+    on the residuals of the seeds from the ratio. With one seed they are over starts, and how much a prior varies from
+    one training to another is not in them.
 
     Args:
         world: where plans are collected and, from other starts, priors are compared.
@@ -118,6 +126,7 @@ def compare(
         length or DEFAULT_LENGTH,
         starts or DEFAULT_STARTS,
         training_starts or DEFAULT_TRAINING_STARTS,
+        max(*budgets, DEFAULT_TRAINING_BUDGET),
     )
     if length is None:
         notes.append(f"Plans have {DEFAULT_LENGTH} actions, as no `length` was given.")
@@ -154,10 +163,12 @@ def _run(
     jobs, reason = _processes(design, (total - 1) * longest, jobs)
     notes += reason
     start_by = deadline - longest * (SAFETY if jobs > 1 else 1.0)
+    if time.time() + (PROCESS_SECONDS if jobs > 1 else 0.0) > start_by:
+        seeds = seeds[:1]  # no other would begin
     rest = partial(_run_numbered, seeds=tuple(seeds), design=design, start_by=start_by)
     printer.print(f"1 of {total} seeds")
     try:
-        for number, outcome in each_result(rest, range(1, total), jobs, name=name):
+        for number, outcome in each_result(rest, range(1, len(seeds)), jobs, name=name):
             if outcome is not None:
                 found[number] = outcome
                 printer.print(f"{len(found)} of {total} seeds")
@@ -187,11 +198,11 @@ def _fit(design: Design, seconds: float, starts: int | None, training_starts: in
     each = seconds_per_step(design.held_out or design.world, design.length)
     cut = fit_starts(design, each, seconds * PLANNING_SHARE / MIN_SEEDS)
     cut = replace(cut, starts=starts or cut.starts, training_starts=training_starts or cut.training_starts)
-    if (cut.starts, cut.training_starts) == (design.starts, design.training_starts):
-        return cut, []
+    if all(getattr(cut, size) == getattr(design, size) for size in ("starts", "training_starts", "training_budget")):
+        return design, []
     return cut, [
         f"A simulator step takes {1e6 * each:.0f} microseconds, so that each seed has {cut.starts} held-out and"
-        f" {cut.training_starts} training starts, not {design.starts} and {design.training_starts}."
+        f" {cut.training_starts} training starts, with {cut.training_budget} plans tried from each."
     ]
 
 

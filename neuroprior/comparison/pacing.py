@@ -4,6 +4,7 @@ import sys
 import threading
 import time
 from dataclasses import replace
+from math import sqrt
 from types import TracebackType
 from typing import Self
 
@@ -18,11 +19,14 @@ MIN_SEEDS = 5
 PLANNING_SHARE = 0.5
 """Share of the time that may go into simulator steps; the rest is for priors and planners."""
 
-MIN_STARTS, MIN_TRAINING_STARTS = 8, 64
-"""Starts that are left however slow the world is."""
+MIN_STARTS, MIN_TRAINING_STARTS, MIN_TRAINING_BUDGET = 4, 64, 64
+"""What is left of each however slow the world is."""
 
-TIMED_SECONDS, MAX_TIMED_PLANS = 0.1, 4096
-"""Simulator steps are timed for so long, or until so many plans were tried at once."""
+TIMED_SECONDS, MAX_TIMED_STARTS = 0.1, 256
+"""Simulator steps are timed for so long, or from so many starts."""
+
+TIMED_PLANS = 16
+"""Plans from each of these starts: few, since worlds may step prefixes that plans share only once."""
 
 SILENT_SECONDS = 8.0
 """Seconds after which progress is printed again."""
@@ -30,20 +34,20 @@ SILENT_SECONDS = 8.0
 
 def seconds_per_step(world: World, length: int) -> float:
     """Seconds that a simulator step takes, of many at once."""
-    generator, number = torch.Generator().manual_seed(0), 1
-    state = world.reset(1, generator)
+    generator, batch = torch.Generator().manual_seed(0), 1
     while True:
-        plans = torch.randint(world.num_actions, (1, number, length), generator=generator).to(state.device)
+        state = world.reset(batch, generator)
+        plans = torch.randint(world.num_actions, (batch, TIMED_PLANS, length), generator=generator)
         begin = time.perf_counter()
-        world.rollout(state, plans, generator)
+        world.rollout(state, plans.to(state.device), generator)
         seconds = time.perf_counter() - begin
-        if seconds > TIMED_SECONDS or number >= MAX_TIMED_PLANS:
-            return seconds / (number * length)
-        number *= 4
+        if seconds > TIMED_SECONDS or batch >= MAX_TIMED_STARTS:
+            return seconds / plans.numel()
+        batch *= 4
 
 
 def fit_starts(design: Design, step_seconds: float, seconds: float) -> Design:
-    """The design with as many starts as there is time for.
+    """The design with as many starts, and as many plans tried in training, as there is time for.
 
     Args:
         design: with the starts that are wanted.
@@ -54,11 +58,12 @@ def fit_starts(design: Design, step_seconds: float, seconds: float) -> Design:
     needed = step_seconds * (training * design.training_starts + held_out * design.starts)
     if needed <= seconds:
         return design
-    share = seconds / needed
+    share, root = seconds / needed, sqrt(seconds / needed)
     return replace(
         design,
         starts=min(design.starts, max(int(share * design.starts), MIN_STARTS)),
-        training_starts=min(design.training_starts, max(int(share * design.training_starts), MIN_TRAINING_STARTS)),
+        training_starts=min(design.training_starts, max(int(root * design.training_starts), MIN_TRAINING_STARTS)),
+        training_budget=min(design.training_budget, max(int(root * design.training_budget), MIN_TRAINING_BUDGET)),
     )
 
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from neuroprior._files import versions, write_json, written_whole
-from neuroprior._statistics import ENOUGH_UNITS, holm, mean_interval, paired_difference
+from neuroprior._statistics import ENOUGH_UNITS, Difference, holm, ratio_difference
 from neuroprior.comparison.contestants import BASELINE
 from neuroprior.comparison.trial import TOLERANCE, Array, Outcome
 
@@ -26,8 +26,8 @@ class Row(NamedTuple):
 
     Attributes:
         planner, prior, budget: which; the budget in candidate plans.
-        score, low, high: the mean normalised score with its 95 % interval: 0 is the mean of random plans, 1 the
-            optimum, or the best score that any decision reached from the same start.
+        score, low, high: the normalised score with its 95 % interval: 0 is the mean of random plans, 1 the optimum, or
+            the best score that any decision reached from the same start.
         difference, difference_low, difference_high: how much higher it is than with uniform plans; NaN for these.
         p, p_holm: two-sided p-value of no difference, and corrected for all rows that have one.
         mean_score: in the world's own units.
@@ -78,18 +78,31 @@ class Comparison:
         return "seeds" if len(self.outcomes) > 1 else "starts"
 
     @cached_property
-    def normalised(self) -> Array:
-        """The normalised scores `[planners, priors, budgets, G]` of G seeds, or starts where there is a single seed.
+    def gains(self) -> tuple[Array, Array]:
+        """What scores gain over random plans, and the most that can be gained, of each of G seeds (or starts of one).
 
-        Seeds from whose starts no plan beats random ones are left out, so that G may be 0.
+        Returns:
+            `[planners, priors, budgets, G]` and `[G]`, which is at least 0.
         """
-        parts = []
+        gains, most = [], []
         for outcome in self.outcomes:
             best = outcome.scores.max((0, 1, 2)) if outcome.best is None else outcome.best
-            gain, most = outcome.scores - outcome.random, float((best - outcome.random).mean())
-            if most > TOLERANCE * max(1.0, float(np.abs(best).max())):
-                parts.append((gain if self.unit == "starts" else gain.mean(-1, keepdims=True)) / most)
-        return np.concatenate([np.empty((*self.outcomes[0].scores.shape[:-1], 0)), *parts], -1)
+            gains.append(outcome.scores - outcome.random)
+            most.append(np.maximum(best - outcome.random, 0.0))
+        if self.unit == "starts":
+            return gains[0], most[0]
+        return np.stack([gain.mean(-1) for gain in gains], -1), np.array([one.mean() for one in most])
+
+    @property
+    def num_units(self) -> int:
+        """How many seeds, or starts of a single seed, there are."""
+        return len(self.gains[1])
+
+    @property
+    def has_gain(self) -> bool:
+        """Whether some plan scores more than random plans do in the mean."""
+        largest = max(float(np.abs(outcome.random).max()) for outcome in self.outcomes)
+        return float(self.gains[1].mean()) > TOLERANCE * max(1.0, largest)
 
     @cached_property
     def rows(self) -> tuple[Row, ...]:
@@ -103,23 +116,25 @@ class Comparison:
 
     def _row(self, planner: int, prior: int, budget: int) -> Row:
         """The row of a planner, a prior and a budget by their numbers, with an uncorrected p-value."""
-        values, uniform = self.normalised[planner, prior, budget], self.normalised[planner, 0, budget]
-        score = low = high = difference = difference_low = difference_high = p = nan
-        if len(values):
-            score, difference = float(values.mean()), nan if prior == 0 else float((values - uniform).mean())
-        if len(values) > 1:
-            score, low, high = mean_interval(values)
-            if prior != 0:
-                difference, difference_low, difference_high, p = paired_difference(values, uniform)
+        own, uniform = self.gains[0][planner, prior, budget], self.gains[0][planner, 0, budget]
+        score, difference = self._normalise(own), self._normalise(own - uniform)
         means = [outcome.scores[planner, prior, budget].mean() for outcome in self.outcomes]
         steps = max(int(outcome.model_steps[planner, prior, budget]) for outcome in self.outcomes)
         return Row(
             *(self.planners[planner], self.priors[prior], self.budgets[budget]),
-            *(score, low, high),
-            *(difference, difference_low, difference_high),
-            *(p, nan),
-            *(float(np.mean(means)), steps),
+            *score[:3],
+            *(difference if prior else (nan, nan, nan, nan)),
+            *(nan, float(np.mean(means)), steps),
         )
+
+    def _normalise(self, gains: Array) -> Difference:
+        """The ratio of gains `[G]` to the most that can be gained, with its interval over seeds (or starts)."""
+        most = self.gains[1]
+        if not self.has_gain:
+            return Difference(nan, nan, nan, nan)
+        if self.num_units == 1:
+            return Difference(float(gains[0] / most[0]), nan, nan, nan)
+        return ratio_difference(gains, most)
 
     def frame(self) -> Any:
         """Return the rows as a table of pandas, with the columns of `Row`.
@@ -199,7 +214,7 @@ class Comparison:
 
         A prior is said to help or to harm only where the corrected p-value is below .05.
         """
-        if not self.normalised.shape[-1]:
+        if not self.has_gain:
             return f"Nothing to compare: no plan of {self.length} actions scores more than random ones do in the mean."
         if len(self.priors) == 1:
             return " ".join(self._uniform_sentence(planner) for planner in self.planners)
@@ -240,7 +255,7 @@ class Comparison:
         )
 
     def _is_significant(self, row: Row) -> bool:
-        return row.p_holm < SIGNIFICANT and self.normalised.shape[-1] >= ENOUGH_UNITS
+        return row.p_holm < SIGNIFICANT and self.num_units >= ENOUGH_UNITS
 
     def __str__(self) -> str:
         """The summary, a table of scores, what they mean, and the notes."""
@@ -268,7 +283,7 @@ class Comparison:
 
     def _legend(self) -> str:
         """What the scores, intervals and stars mean."""
-        units, tests = self.normalised.shape[-1], sum(not isnan(row.p) for row in self.rows)
+        units, tests = self.num_units, sum(not isnan(row.p) for row in self.rows)
         scale = f"Scores by budget in plans: 1 is {self.scale} from the same start, 0 the mean of random plans"
         if units < 2:
             return f"{scale}; no intervals, which need two {self.unit}."

@@ -37,9 +37,6 @@ TRAINING_RANDOM_PLANS = 16
 SCORE_ROLLOUTS = 64
 """Fresh rollouts that score a plan in a stochastic world that is no table."""
 
-MIN_TRAINING_BUDGET = 256
-"""Plans that are tried from each training start, at least."""
-
 MIN_LEARNED = 20
 """Fewer plans than this are not learned from."""
 
@@ -64,6 +61,7 @@ class Design:
         length: actions in a plan.
         starts: from which planners are compared.
         training_starts: from which plans are collected.
+        training_budget: plans that are tried from each of them.
     """
 
     world: World
@@ -74,11 +72,7 @@ class Design:
     length: int
     starts: int
     training_starts: int
-
-    @property
-    def training_budget(self) -> int:
-        """Plans that are tried from each training start."""
-        return max(*self.budgets, MIN_TRAINING_BUDGET)
+    training_budget: int
 
     @property
     def model_steps(self) -> tuple[int, int]:
