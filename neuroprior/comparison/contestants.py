@@ -116,10 +116,13 @@ def fit_markov(plans: Plans, generator: torch.Generator) -> MarkovPrior:
     """
     learned, held_out = plans.split(VALIDATION, generator)
     parts, num_contexts = counting_parts(learned, held_out), context_arguments(plans).get("num_contexts")
-    chains = [best_chain(parts, number) for number in dict.fromkeys((None, num_contexts))]
-    return max(
-        (chain for chain in chains if chain is not None), key=lambda chain: float(chain.log_prob(held_out).sum())
-    )
+    tried = [best_chain(parts, number) for number in dict.fromkeys((None, num_contexts))]
+
+    def log_likelihood(chain: MarkovPrior) -> float:
+        known = held_out if chain.takes_context else held_out.without_context()
+        return float(chain.log_prob(known).sum())
+
+    return max((chain for chain in tried if chain is not None), key=log_likelihood)
 
 
 def make_planner(

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from typing import Literal, NamedTuple
 
@@ -204,6 +204,10 @@ def training_plans(design: Design, state: Tensor, generator: torch.Generator) ->
     else:
         planner = FrontierPlanner(uniform, design.length, design.training_budget, **goal)
     plans = collect(planner, world, state=state, context=world_context(world), generator=generator)
+    number = getattr(getattr(world, "observation", None), "number", None)
+    if number is not None and plans.context is not None and plans.context.dim() == 2:
+        # A prior has as many contexts as there are names, and from other starts more may occur.
+        plans = replace(plans, context_names=tuple(map(str, range(number))))
     seed = draw_seed(generator)
     random = random_scores(world, state, design.length, TRAINING_RANDOM_PLANS, generator, seed)
     actual = true_scores(world, state, plans.actions[:, None], seed)[:, 0]
