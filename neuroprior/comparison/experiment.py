@@ -166,16 +166,17 @@ def _run(
     if time.time() + (PROCESS_SECONDS if jobs > 1 else 0.0) > start_by:
         seeds = seeds[:1]  # no other would begin
     rest = partial(_run_numbered, seeds=tuple(seeds), design=design, start_by=start_by)
-    printer.print(f"1 of {total} seeds")
+    printer.tell(f"1 of {total} seeds")
     try:
         for number, outcome in each_result(rest, range(1, len(seeds)), jobs, name=name):
             if outcome is not None:
                 found[number] = outcome
-                printer.print(f"{len(found)} of {total} seeds")
+                printer.tell(f"{len(found)} of {total} seeds")
         if len(found) < total:
             notes.append(f"Time for {len(found)} of {total} seeds; give more `seconds` for narrower intervals.")
     except KeyboardInterrupt:
         notes.append(f"Interrupted after {len(found)} of {total} seeds.")
+    printer.print(f"{len(found)} of {total} seeds")
     return [found[number] for number in sorted(found)], notes
 
 

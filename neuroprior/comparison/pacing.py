@@ -68,7 +68,7 @@ def fit_starts(design: Design, step_seconds: float, seconds: float) -> Design:
 
 
 class Progress:
-    """Prints to standard error what is done at present: at once when seeds are finished, else every few seconds.
+    """Prints to standard error what is done at present, every few seconds.
 
     Args:
         shown: False: print nothing.
@@ -91,7 +91,7 @@ class Progress:
         self._ended.set()
 
     def tell(self, status: str) -> None:
-        """Set what is done at present, which is printed if nothing was for a while."""
+        """Set what is done at present, to be printed when nothing was for a while."""
         self._status = status
 
     def print(self, status: str) -> None:
