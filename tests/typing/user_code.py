@@ -33,8 +33,8 @@ from neuroprior import (
     write_plans,
 )
 from neuroprior.behaviour import DurationModel, mean_interval
-from neuroprior.control import DoubleIntegrator, ICEMPlanner, NoisePrior, VectorDecision, VectorPlans, VectorPrior
 from neuroprior.comparison import Comparison
+from neuroprior.control import DoubleIntegrator, ICEMPlanner, NoisePrior, VectorDecision, VectorPlans, VectorPrior
 from neuroprior.planners import Decision, Execution, execute
 from neuroprior.priors.learning import training_plans
 from neuroprior.testing import check_planner, check_prior, check_world

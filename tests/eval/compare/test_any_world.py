@@ -30,13 +30,13 @@ def module(tmp_path, monkeypatch):
 
 def test_the_command_compares_and_writes(module, tmp_path, capsys):
     out = tmp_path / "out"
-    options = ["--planners", "sampling", "mcts", "--kinds", "markov", "macro", *QUICK, "--out", str(out)]
+    options = ["--planners", "sampling", "frontier", "--kinds", "markov", "macro", *QUICK, "--out", str(out)]
     assert main(["compare", "--world", f"{module}:make_world", *options]) == 0
     printed = capsys.readouterr().out
     content = json.loads((out / "comparison.json").read_text())
     assert content["summary"] in printed
     assert content["priors"] == ["uniform", "markov", "macro"]
-    assert content["planners"] == ["sampling", "mcts"]
+    assert content["planners"] == ["sampling", "frontier"]
     assert (content["budgets"], content["length"], len(content["seeds"])) == ([2, 8], 5, 2)
     assert len((out / "comparison.csv").read_text().splitlines()) == 1 + 2 * 3 * 2
     assert (out / "comparison.png").read_bytes().startswith(b"\x89PNG")
