@@ -50,10 +50,10 @@ def name_priors(priors: object, world: World) -> dict[str, PriorSource]:
         ValueError: one is unknown or does not fit the world, or two have the same name.
     """
     named = _by_name("priors", priors, _prior_name)
-    if all(type(source) is UniformPrior or source == BASELINE for name, source in named.items() if name == BASELINE):
-        named = {BASELINE: BASELINE} | named
-    else:
+    baseline = named.get(BASELINE, BASELINE)
+    if baseline not in (BASELINE, UniformPrior) and type(baseline) is not UniformPrior:
         raise ValueError(f"`priors` must be named otherwise than {BASELINE}, which all are compared with")
+    named = {BASELINE: baseline} | named
     for name, source in named.items():
         _check_prior(name, source, world)
     return named

@@ -271,11 +271,11 @@ def test_starts_are_held_out():
 
 
 def test_only_plans_better_than_random_are_learned_from():
-    """Of few plans most fail: some 60 of 200 starts are left, whose plans are all the same."""
-    design = Design(path_world(), None, {}, {}, (1,), LENGTH, 10, 200, 4)
-    plans = training_plans(design, torch.zeros(200, dtype=torch.long), seeded())
+    """A single plan from each start reaches the goal from one in 16 of 600: 37, with a standard deviation of 6."""
+    design = Design(path_world(), None, {}, {}, (1,), LENGTH, 10, 600, 1)
+    plans = training_plans(design, torch.zeros(600, dtype=torch.long), seeded())
     assert plans is not None
-    assert len(plans) < 150
+    assert 20 <= len(plans) < 67
     assert (plans.actions == 1).all()
     assert training_plans(design, torch.zeros(19, dtype=torch.long), seeded()) is None
     barren = gridworld(4, 4, seed=0)
