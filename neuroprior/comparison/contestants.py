@@ -119,8 +119,8 @@ def fit_markov(plans: Plans, generator: torch.Generator) -> MarkovPrior:
     tried = [best_chain(parts, number) for number in dict.fromkeys((None, num_contexts))]
 
     def log_likelihood(chain: MarkovPrior) -> float:
-        known = held_out if chain.takes_context else held_out.without_context()
-        return float(chain.log_prob(known).sum())
+        scored = held_out if chain.takes_context else held_out.without_context()
+        return float(chain.log_prob(scored).sum())
 
     return max((chain for chain in tried if chain is not None), key=log_likelihood)
 

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from math import inf, isfinite
@@ -150,16 +150,19 @@ def _run(
     design: Design, seeds: Sequence[int], jobs: int, deadline: float, printer: Progress
 ) -> tuple[list[Outcome], list[str]]:
     """The outcomes of the seeds that were finished, in order, and notes on what was not."""
-    total, found, notes = len(seeds), {}, []
-    name: Callable[[int], str] = "seed {}".format
+    total, notes = len(seeds), []
+    outcomes: dict[int, Outcome] = {}
 
-    def first(number: int) -> Outcome | None:
+    def name(number: int) -> str:
+        return f"seed {number + 1}"
+
+    def run_first(number: int) -> Outcome | None:
         return run_seed(seeds[number], design, lambda what: printer.tell(f"seed 1 of {total}: {what}"))
 
-    for _, outcome in each_result(first, [0], 1, name=name):
+    for _, outcome in each_result(run_first, [0], 1, name=name):
         assert outcome is not None
-        found[0] = outcome
-    longest = found[0].seconds
+        outcomes[0] = outcome
+    longest = outcomes[0].seconds
     jobs, reason = _processes(design, (total - 1) * longest, jobs)
     notes += reason
     start_by = deadline - longest * (SAFETY if jobs > 1 else 1.0)
@@ -170,14 +173,14 @@ def _run(
     try:
         for number, outcome in each_result(rest, range(1, len(seeds)), jobs, name=name):
             if outcome is not None:
-                found[number] = outcome
-                printer.tell(f"{len(found)} of {total} seeds")
-        if len(found) < total:
-            notes.append(f"Time for {len(found)} of {total} seeds; give more `seconds` for narrower intervals.")
+                outcomes[number] = outcome
+                printer.tell(f"{len(outcomes)} of {total} seeds")
+        if len(outcomes) < total:
+            notes.append(f"Time for {len(outcomes)} of {total} seeds; give more `seconds` for narrower intervals.")
     except KeyboardInterrupt:
-        notes.append(f"Interrupted after {len(found)} of {total} seeds.")
-    printer.print(f"{len(found)} of {total} seeds")
-    return [found[number] for number in sorted(found)], notes
+        notes.append(f"Interrupted after {len(outcomes)} of {total} seeds.")
+    printer.print(f"{len(outcomes)} of {total} seeds")
+    return [outcomes[number] for number in sorted(outcomes)], notes
 
 
 def _run_numbered(number: int, seeds: Sequence[int], design: Design, start_by: float) -> Outcome | None:
@@ -214,10 +217,10 @@ def _describe(outcomes: Sequence[Outcome], design: Design, where: World) -> list
         notes.append("All starts are the same state: priors learned from plans that begin where they are compared.")
     idle = sum(outcome.num_learned == 0 for outcome in outcomes)
     if idle and any(map(learns, design.priors.values())):
-        of_all = "no seed" if idle == len(outcomes) else f"{len(outcomes) - idle} of {len(outcomes)} seeds"
+        where_not = "" if idle == len(outcomes) else f" in {idle} of {len(outcomes)} seeds"
         notes.append(
-            f"Priors learned in {of_all}: elsewhere fewer than {MIN_LEARNED} of {design.training_starts} training plans"
-            " scored more than random ones, and priors stayed uniform. Longer plans or more budget may help."
+            f"Priors learned nothing{where_not}: fewer than {MIN_LEARNED} of {design.training_starts} training plans"
+            " scored more than random ones. Longer plans or larger budgets may help."
         )
     if where.stochastic and outcomes[0].best is not None:
         notes.append("The optimum is that of policies that see each state, which no plan may reach.")

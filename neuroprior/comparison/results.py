@@ -116,8 +116,8 @@ class Comparison:
 
     def _row(self, planner: int, prior: int, budget: int) -> Row:
         """The row of a planner, a prior and a budget by their numbers, with an uncorrected p-value."""
-        own, uniform = self.gains[0][planner, prior, budget], self.gains[0][planner, 0, budget]
-        score, difference = self._normalise(own), self._normalise(own - uniform)
+        gains, uniform = self.gains[0][planner, prior, budget], self.gains[0][planner, 0, budget]
+        score, difference = self._normalise(gains), self._normalise(gains - uniform)
         means = [outcome.scores[planner, prior, budget].mean() for outcome in self.outcomes]
         steps = max(int(outcome.model_steps[planner, prior, budget]) for outcome in self.outcomes)
         return Row(
@@ -165,9 +165,9 @@ class Comparison:
         panels = figure.subplots(1, len(self.planners), sharey=True, squeeze=False)[0]
         for planner, panel in zip(self.planners, panels, strict=True):
             for prior in self.priors:
-                own = [row for row in self.rows if (row.planner, row.prior) == (planner, prior)]
-                (line,) = panel.plot(self.budgets, [row.score for row in own], marker="o", markersize=4, label=prior)
-                low, high = [row.low for row in own], [row.high for row in own]
+                rows = [row for row in self.rows if (row.planner, row.prior) == (planner, prior)]
+                (line,) = panel.plot(self.budgets, [row.score for row in rows], marker="o", markersize=4, label=prior)
+                low, high = [row.low for row in rows], [row.high for row in rows]
                 panel.fill_between(self.budgets, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
             panel.set_xscale("log", base=2)
             panel.set_xticks(self.budgets, [f"{budget:,}" for budget in self.budgets])
@@ -212,7 +212,8 @@ class Comparison:
     def summary(self) -> str:
         """Say in a sentence for each planner whether a prior helps it.
 
-        A prior is said to help or to harm only where the corrected p-value is below .05.
+        A prior is said to help or to harm only where the corrected p-value is below .05. Of several such differences the
+        largest is named, which is larger than it would be again.
         """
         if not self.has_gain:
             return f"Nothing to compare: no plan of {self.length} actions scores more than random ones do in the mean."
@@ -221,10 +222,10 @@ class Comparison:
         return " ".join(self._sentence(planner) for planner in self.planners)
 
     def _sentence(self, planner: str) -> str:
-        own = [row for row in self.rows if row.planner == planner and row.prior != BASELINE]
+        rows = [row for row in self.rows if row.planner == planner and row.prior != BASELINE]
         uniform = {row.budget: row for row in self.rows if row.planner == planner and row.prior == BASELINE}
-        certain = [row for row in own if self._is_significant(row)]
-        most = max(own, key=lambda row: row.difference)
+        certain = [row for row in rows if self._is_significant(row)]
+        most = max(rows, key=lambda row: row.difference)
         helpful = max((row for row in certain if row.difference > 0), key=lambda row: row.difference, default=None)
         harmful = min((row for row in certain if row.difference < 0), key=lambda row: row.difference, default=None)
         if helpful is not None:
