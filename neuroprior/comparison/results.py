@@ -212,8 +212,8 @@ class Comparison:
     def summary(self) -> str:
         """Say in a sentence for each planner whether a prior helps it.
 
-        A prior is said to help or to harm only where the corrected p-value is below .05. Of several such differences the
-        largest is named, which is larger than it would be again.
+        A prior is said to help or to harm only where the corrected p-value is below .05. Of several such differences
+        the largest is named, which a new comparison would on average find smaller.
         """
         if not self.has_gain:
             return f"Nothing to compare: no plan of {self.length} actions scores more than random ones do in the mean."
