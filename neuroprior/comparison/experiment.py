@@ -93,7 +93,7 @@ def compare(
         training_starts: starts from which training plans are collected; None: 500, or fewer where steps are slow.
         seeds: independent repeats, at most.
         seconds: the time in which all should be done: no seed is begun that would end later if it took about as long as
-            the first, which is always finished. None: no limit, so that the result does not depend on the speed of the machine.
+            the first, which is always finished. None: no limit, so that the result does not depend on the machine.
         jobs: processes; None: one for each core. The results do not depend on it, unless the time is up.
         progress: print what is done to standard error.
         generator: source of randomness.
