@@ -8,7 +8,7 @@ from math import inf, log, log2
 import torch
 from torch import Tensor
 
-from neuroprior.behaviour.analysis.statistics import ENOUGH_UNITS, ROUNDING, Difference, ratio_difference
+from neuroprior._statistics import ENOUGH_UNITS, ROUNDING, Difference, ratio_difference
 from neuroprior.plans import Plans
 from neuroprior.plans.columns import never_occur
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
