@@ -10,7 +10,6 @@ import torch
 
 from neuroprior._checks import kind_of
 from neuroprior.planners import FrontierPlanner, MCTSPlanner, Planner, SamplingPlanner
-from neuroprior.planners.planner import Objective
 from neuroprior.plans import Plans
 from neuroprior.priors import CombinedPrior, MarkovPrior, Prior, UniformPrior
 from neuroprior.priors.construction import context_arguments
@@ -30,7 +29,7 @@ PriorSource: TypeAlias = str | Steppable | MakePrior
 """A name in `neuroprior.priors.fitting.PRIORS`, a prior, or its class or a function that makes it."""
 
 MakePlanner: TypeAlias = Callable[..., Planner]
-"""A planner's class, or a function, called with a prior, `length`, `num_plans`, `objective` and `discount`."""
+"""A planner's class, or a function, called with a prior, `length` and `num_plans`."""
 
 PLANNERS: dict[str, MakePlanner] = {"sampling": SamplingPlanner, "frontier": FrontierPlanner, "mcts": MCTSPlanner}
 """Planners by name."""
@@ -125,9 +124,7 @@ def fit_markov(plans: Plans, generator: torch.Generator) -> MarkovPrior:
     return max((chain for chain in tried if chain is not None), key=log_likelihood)
 
 
-def make_planner(
-    source: str | MakePlanner, prior: Steppable, world: World, length: int, budget: int, goal: Objective
-) -> Planner:
+def make_planner(source: str | MakePlanner, prior: Steppable, world: World, length: int, budget: int) -> Planner:
     """A planner that takes at most `budget * length` simulator steps for each start.
 
     In a stochastic world the sampling planner tries a root of the budget of plans, each about as many times. A prior
@@ -135,10 +132,10 @@ def make_planner(
     """
     make = PLANNERS[source] if isinstance(source, str) else source
     if source != "sampling" or not world.stochastic:
-        return make(prior, length=length, num_plans=budget, **goal)
+        return make(prior, length=length, num_plans=budget)
     in_world = Stepper(prior).context_per is not None
     tries = max(isqrt(budget), 1 + in_world)
-    return make(prior, length=length, num_plans=max(budget // tries, 1), num_rollouts=tries - in_world, **goal)
+    return make(prior, length=length, num_plans=max(budget // tries, 1), num_rollouts=tries - in_world)
 
 
 def _by_name(argument: str, values: object, name: Callable[[Any], str]) -> dict[str, Any]:

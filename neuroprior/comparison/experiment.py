@@ -67,8 +67,8 @@ def compare(
     In each of several repeats (seeds), starts are drawn by `world.reset`, and a planner without a prior plans from the
     training starts. Each prior learns from those of its plans that beat random ones. Then every planner plans from the
     held-out starts with every prior, and what the chosen plans really get is scored: exactly in deterministic worlds
-    and in tables, else by fresh rollouts. Planners optimise the world's `objective` and `discount`, if it has them, or
-    the sum of rewards. Priors get the world's observations as context if it declares an `observation`.
+    and in tables, else by fresh rollouts. Planners optimise the world's objective. Priors get the world's observations
+    as context if it declares an `observation`.
 
     What is independent is the seed: starts and priors are drawn anew in each, and all priors and planners share them.
     So each seed counts once, with the means over its starts. A score is the ratio of two sums over seeds: what was
@@ -83,8 +83,8 @@ def compare(
             that has learned, such as a loaded one, is compared as it is; others are fitted anew in each seed. All are
             compared with "uniform".
         planners: names ("sampling", "frontier", "mcts"), and classes or functions that are called with a prior,
-            `length`, `num_plans`, `objective` and `discount`; or a mapping of names to these. Those of the names that
-            cannot plan in a stochastic world are left out there.
+            `length` and `num_plans`; or a mapping of names to these. Those of the names that cannot plan in a
+            stochastic world are left out there.
         budgets: numbers of candidate plans for each start. Every planner may take so many times `length` simulator
             steps. In a stochastic world the sampling planner tries fewer plans, each several times.
         held_out: another world of the same actions, where priors are compared; None: in `world`.

@@ -15,18 +15,16 @@ from neuroprior._random import draw_seed
 from neuroprior.comparison.contestants import MakePlanner, PriorSource, fit_prior, make_planner
 from neuroprior.planners import (
     Decision,
-    FrontierPlanner,
     SamplingPlanner,
     collect,
     expected_score,
     mean_scores,
     oracle,
 )
-from neuroprior.planners.planner import Objective
 from neuroprior.plans import Plans
 from neuroprior.priors import UniformPrior
 from neuroprior.sampling import sample_in_world
-from neuroprior.worlds import TabularWorld, World
+from neuroprior.worlds import Categories, TabularWorld, World
 
 RANDOM_PLANS = 64
 """Random plans from each held-out start, whose mean score counts as 0."""
@@ -104,16 +102,6 @@ class Outcome(NamedTuple):
     seconds: float
 
 
-def world_goal(world: World) -> Objective:
-    """What counts in a world, as it says itself; the sum of rewards where it does not."""
-    return {"objective": getattr(world, "objective", "return"), "discount": getattr(world, "discount", 1.0)}
-
-
-def world_context(world: World) -> Literal["step"] | None:
-    """The context of priors: what the world says that it observes before each action, or None where it does not say."""
-    return None if getattr(world, "observation", None) is None else "step"
-
-
 def run_seed(
     seed: int, design: Design, report: Callable[[str], None] | None = None, start_by: float = inf
 ) -> Outcome | None:
@@ -156,7 +144,7 @@ def run_seed(
         for k, (planner_name, make) in enumerate(design.planners.items()):
             tell(f"planning with {name} and {planner_name}")
             for b, budget in enumerate(design.budgets):
-                planner = make_planner(make, prior, held_out, design.length, budget, world_goal(held_out))
+                planner = make_planner(make, prior, held_out, design.length, budget)
                 decision = planner.plan(held_out, state, fresh(plan_seed))
                 check_decision(decision, planner_name, design.length, budget)
                 actual = true_scores(held_out, state, decision.plan[:, None], score_seed)
@@ -198,16 +186,14 @@ def training_plans(design: Design, state: Tensor, generator: torch.Generator) ->
 
     None: fewer than `MIN_LEARNED` do.
     """
-    world, goal, uniform = design.world, world_goal(design.world), UniformPrior(design.world.num_actions)
-    if world.stochastic:
-        planner = make_planner("sampling", uniform, world, design.length, design.training_budget, goal)
-    else:
-        planner = FrontierPlanner(uniform, design.length, design.training_budget, **goal)
-    plans = collect(planner, world, state=state, context=world_context(world), generator=generator)
-    number = getattr(getattr(world, "observation", None), "number", None)
-    if number is not None and plans.context is not None and plans.context.dim() == 2:
+    world, uniform = design.world, UniformPrior(design.world.num_actions)
+    name = "sampling" if world.stochastic else "frontier"
+    planner = make_planner(name, uniform, world, design.length, design.training_budget)
+    context: Literal["step"] | None = None if world.observation is None else "step"
+    plans = collect(planner, world, state=state, context=context, generator=generator)
+    if isinstance(world.observation, Categories):
         # A prior has as many contexts as there are names, and from other starts more may occur.
-        plans = replace(plans, context_names=tuple(map(str, range(number))))
+        plans = replace(plans, context_names=tuple(map(str, range(world.observation.number))))
     seed = draw_seed(generator)
     random = random_scores(world, state, design.length, TRAINING_RANDOM_PLANS, generator, seed)
     actual = true_scores(world, state, plans.actions[:, None], seed)[:, 0]
@@ -232,11 +218,9 @@ def true_scores(world: World, state: Tensor, plans: Tensor, seed: int) -> Tensor
         plans: `[B, P, L]`.
         seed: of the rollouts, which no planner has seen.
     """
-    goal = world_goal(world)
     if world.stochastic and isinstance(world, TabularWorld):
-        exact = expected_score(world, state, plans, objective=goal["objective"], discount=goal["discount"])
-        return exact.double()
-    judge = SamplingPlanner(UniformPrior(world.num_actions), plans.shape[2], 1, **goal)
+        return expected_score(world, state, plans).double()
+    judge = SamplingPlanner(UniformPrior(world.num_actions), plans.shape[2], 1)
     return mean_scores(judge, world, state, plans, SCORE_ROLLOUTS, torch.Generator().manual_seed(seed))[0].double()
 
 
@@ -246,8 +230,7 @@ def optimum(world: World, state: Tensor, length: int) -> Tensor | None:
         return None
     if length * world.num_maps * world.num_states * world.num_actions > MAX_ORACLE_STEPS:
         return None
-    goal = world_goal(world)
-    return oracle(world, state, length, objective=goal["objective"], discount=goal["discount"])
+    return oracle(world, state, length)
 
 
 def check_decision(decision: Decision, name: str, length: int, budget: int) -> None:

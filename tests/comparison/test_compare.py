@@ -3,7 +3,6 @@
 import random
 import sys
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from neuroprior.comparison import Row, experiment
 from neuroprior.comparison.contestants import fit_markov, fit_prior, learns, make_planner, name_priors
 from neuroprior.comparison.trial import Design, draw_starts, run_seed, training_plans, true_scores
 from neuroprior.planners import Decision, Planner
-from neuroprior.worlds import EpisodicWorld
+from neuroprior.worlds import Categories, EpisodicWorld
 from tests.support.sources import refuses
 
 LENGTH = 4
@@ -105,6 +104,7 @@ def test_a_noisy_table_is_scored_exactly():
     outcomes = torch.zeros(1, 2, 2, dtype=torch.long)
     reward = torch.tensor([[[1.0, 0.0], [0.5, 0.0]]])
     world = TabularWorld(outcomes, reward, probability=torch.tensor([[[0.3, 0.7], [0.5, 0.5]]]))
+    world.objective = "return"
     plans = torch.tensor([[[0, 0, 1], [1, 1, 1]]])
     assert true_scores(world, torch.tensor([0]), plans, 0)[0].tolist() == pytest.approx([0.85, 0.75])
 
@@ -287,16 +287,13 @@ def test_only_plans_better_than_random_are_learned_from():
     assert "uniform  -" in str(comparison)
 
 
-class Categories(NamedTuple):
-    number: int
-
-
 def test_observations_are_contexts_only_if_the_world_declares_them():
     """In cell s action s % 2 leads on to the next cell of a ring, and the other back; a step on gives 1."""
     cells = torch.arange(8)
     ahead, back, even = (cells + 1) % 8, (cells - 1) % 8, cells % 2 == 0
     next_state = torch.stack([torch.where(even, ahead, back), torch.where(even, back, ahead)], 1)
     world = TabularWorld(next_state, torch.stack([even.float(), (~even).float()], 1))
+    world.objective, world.observation = "return", None
     design = Design(world, None, {}, {}, (1,), 6, 10, 60, 64)
     state = torch.zeros(60, dtype=torch.long)
     blind = training_plans(design, state, seeded())
@@ -321,7 +318,7 @@ def test_stochastic_worlds_are_left_to_planners_that_can_plan_there():
     with refuses("`planners` must have one for stochastic worlds"):
         compare(Noisy(), ["uniform"], ["mcts"], [4], **QUICK)
     for budget in (1, 2, 16, 256):
-        planner = make_planner("sampling", Fixed(0.0, 0.0, 0.0), Noisy(), 5, budget, {})
+        planner = make_planner("sampling", Fixed(0.0, 0.0, 0.0), Noisy(), 5, budget)
         assert isinstance(planner, SamplingPlanner)
         assert 0 < planner.model_steps(Noisy()) <= budget * 5
 
