@@ -6,14 +6,19 @@ from neuroprior.worlds.grid import GridWorld, egocentric, goal_direction, gridwo
 from neuroprior.worlds.gymnasium import SteppedWorld, from_gymnasium
 from neuroprior.worlds.labyrinth import labyrinth
 from neuroprior.worlds.mazes import four_rooms, maze
+from neuroprior.worlds.observations import Categories, Features
+from neuroprior.worlds.simulators import SimulatorWorld, from_simulator
 from neuroprior.worlds.tabular import TabularWorld
 from neuroprior.worlds.world import Rollout, World
 
 __all__ = [
+    "Categories",
     "EpisodicWorld",
+    "Features",
     "GridWorld",
     "PocketCube",
     "Rollout",
+    "SimulatorWorld",
     "SteppedWorld",
     "TabularWorld",
     "World",
@@ -21,6 +26,7 @@ __all__ = [
     "egocentric",
     "four_rooms",
     "from_gymnasium",
+    "from_simulator",
     "goal_direction",
     "gridworld",
     "labyrinth",

@@ -1,0 +1,540 @@
+"""Simulators as worlds: a planner tries plans in copies of them."""
+
+import copy
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from operator import methodcaller
+from typing import Any, Literal, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuroprior._checks import check_count, check_range, check_sizes, kind_of
+from neuroprior._random import draw_seed, generator_on
+from neuroprior.worlds.observations import Categories, Features
+from neuroprior.worlds.simulators.copies import (
+    CloneCopier,
+    Copier,
+    DeepCopier,
+    PickleCopier,
+    ReplayCopier,
+    StateCopier,
+)
+from neuroprior.worlds.simulators.driver import Driver, Path, View, follow_plans, make_simulator
+from neuroprior.worlds.simulators.fingerprints import fingerprint
+from neuroprior.worlds.simulators.generators import keep_global_generators, seed_generators
+from neuroprior.worlds.simulators.store import Recent, Store
+from neuroprior.worlds.simulators.trials import Noise, Start, require_same_starts, try_out
+from neuroprior.worlds.world import Rollout, World, check_plans, on_cpu
+
+MAX_SNAPSHOTS, MAX_VIEWS = 2048, 2**15
+"""Copies of simulators that are kept, and views (observations and legal actions) of states."""
+
+
+class SimulatorWorld(World):
+    """Simulators that are copied and stepped; see `from_simulator`.
+
+    A state is the number of a simulator's state, int64: it says how that state is reached, by which actions under
+    which noise. Copies of simulators are kept for the states that were used last; others are reached again by the same
+    steps. So states take little memory, and stay valid as long as the world.
+
+    Args:
+        driver: steps the simulators.
+        copier: copies them.
+        noise: whether they are stochastic, and draw random numbers at all.
+        make: a function from a seed to a simulator at the start of an episode; None: there are only `starts`.
+        starts: where episodes begin; none: `make` makes new ones.
+        workers: processes that share the plans of a rollout.
+        prepare: a function from a simulator that `state_of` is given to one of the same kind as the others.
+
+    Attributes:
+        observation: what `observe` returns: `Categories`, `Features`, or None.
+        objective, discount: what counts in this world.
+        max_snapshots: the most copies that are kept.
+    """
+
+    def __init__(
+        self,
+        driver: Driver,
+        copier: Copier,
+        noise: Noise,
+        make: Callable[[int], tuple[Any, Any, Any]] | None,
+        starts: Sequence[Start],
+        workers: int | None = None,
+        prepare: Callable[[Any], Any] = lambda simulator: simulator,
+    ) -> None:
+        self.num_actions, self.observation = driver.num_actions, driver.observation
+        self.stochastic, self.all_legal = noise.stochastic, not driver.has_masks
+        self.objective, self.discount = "return", 1.0
+        self._driver, self._copier, self._draws, self._make = driver, copier, noise.draws, make
+        self._workers, self._prepare = workers, prepare
+        self._store = Store(self.num_actions, not self.stochastic)
+        self._pinned: dict[int, Any] = {}
+        self._pinned_views: dict[int, View] = {}
+        self._snapshots, self._views = Recent[Any](MAX_SNAPSHOTS), Recent[View](MAX_VIEWS)
+        self._starts = [self._pin(start) for start in starts]
+
+    @property
+    def max_snapshots(self) -> int:
+        """The most copies that are kept."""
+        return self._snapshots.size
+
+    @max_snapshots.setter
+    def max_snapshots(self, size: int) -> None:
+        check_sizes(max_snapshots=size)
+        self._snapshots = Recent(size)
+
+    def to(self, device: torch.device | str) -> Self:
+        """Raise ValueError for any other device than the CPU, on which simulators are stepped."""
+        return on_cpu(self, device)
+
+    def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
+        """States `[batch_size]`: the present states of the simulators, with equal probability.
+
+        Of a function that makes simulators: new ones, whose noise is drawn by `generator`.
+        """
+        check_count("batch_size", batch_size)
+        generator = generator_on(generator, "cpu")
+        if self._starts:
+            return torch.tensor(self._starts)[torch.randint(len(self._starts), (batch_size,), generator=generator)]
+        seeds = torch.randint(2**62, (batch_size,), generator=generator).tolist()
+        return torch.tensor([self._store.add_start(seed) for seed in seeds], dtype=torch.long)
+
+    def state_of(self, simulator: Any, observation: Any = None, info: Any = None) -> Tensor:
+        """The states `[B]` that stand for the present states of simulators of the same kind.
+
+        Args:
+            simulator: one simulator, or a list of them; they stay as they are.
+            observation: what its last `step` returned (a list for a list); only where that is observed.
+            info: likewise; only where its `action_mask` says which actions are legal.
+        """
+        several = isinstance(simulator, list | tuple)
+        each = list(simulator) if several else [simulator]
+        observations, infos = (list(x) if several and x is not None else [x] * len(each) for x in (observation, info))
+        with keep_global_generators():
+            found = [
+                self._pin(enter(self._driver, self._copier, self._prepare(one), *seen))
+                for one, *seen in zip(each, observations, infos, strict=True)
+            ]
+        return torch.tensor(found, dtype=torch.long)
+
+    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        """See `World.step`. An action that is not legal changes nothing, with a reward of 0."""
+        seeds = self._draw_seeds((len(state),), generator).tolist()
+        after, rewards = state.tolist(), [0.0] * len(state)
+        with keep_global_generators():
+            for row, (start, one, seed) in enumerate(zip(state.tolist(), action.tolist(), seeds, strict=True)):
+                if not self._is_over(start):
+                    after[row], rewards[row] = self._take(start, one, seed)
+        return torch.tensor(after, dtype=torch.long), torch.tensor(rewards, dtype=torch.float64)
+
+    def rollout(
+        self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
+    ) -> Rollout:
+        """See `World.rollout`. A simulator is copied once a plan; each plan meets noise of its own.
+
+        In a deterministic world the same plans of a start are tried once.
+        """
+        self.check_state(state)
+        check_plans(plans, len(state), self.num_actions)
+        batch, num_plans, length = plans.shape
+        seeds = self._draw_seeds((batch, num_plans), generator)
+        rewards = np.zeros((batch, num_plans, length))
+        final = state[:, None].repeat(1, num_plans).numpy()
+        states = state[:, None, None].repeat(1, num_plans, length).numpy() if keep_states else None
+        with keep_global_generators():
+            for row, start in enumerate(state.tolist()):  # a simulator runs one plan at a time
+                if self._is_over(start) or not length:
+                    continue
+                tried: dict[tuple[int, ...], tuple[Path, int]] = {}
+                keys = [(*plan, seed) for plan, seed in zip(plans[row].tolist(), seeds[row].tolist(), strict=True)]
+                distinct = list(dict.fromkeys(keys))
+                paths = self._follow(start, distinct, keep_states)
+                for key, path in zip(distinct, paths, strict=True):
+                    tried[key] = path, self._store.add(start, path.taken, key[-1], path.last_reward(), path.ended)
+                    if path.views:
+                        self._views.put(tried[key][1], path.views[-1])
+                for column, key in enumerate(keys):
+                    path, final[row, column] = tried[key]
+                    rewards[row, column, : len(path.rewards)] = path.rewards
+                    if states is not None:
+                        states[row, column] = self._number_path(start, path, key[-1], length)
+        kept = None if states is None else torch.from_numpy(states)
+        return Rollout(torch.from_numpy(final), torch.from_numpy(rewards), kept)
+
+    def observe(self, state: Tensor) -> Tensor:
+        """The observation in each state: int64 `[N]` of `Categories`, float32 `[N, C]` of `Features`.
+
+        Raises:
+            ValueError: the world has no observation, or that of a start is not known.
+        """
+        if self.observation is None:
+            raise ValueError("`observe` must be given to from_simulator for a world in which something is observed")
+        seen = [view.observation for view in self._all_views(state)]
+        if any(one is None for one in seen):
+            raise ValueError("observation: what was observed last in a running simulator must be given to `state_of`")
+        if isinstance(self.observation, Categories):
+            return torch.tensor(seen, dtype=torch.long)
+        return torch.from_numpy(np.array(seen, dtype=np.float32).reshape(len(seen), self.observation.size))
+
+    def legal_actions(self, state: Tensor) -> Tensor:
+        """Which actions are legal in each state, bool `[N, A]`; where an episode has ended, all."""
+        legal = torch.ones(len(state), self.num_actions, dtype=torch.bool)
+        if self.all_legal:
+            return legal
+        for row, view in enumerate(self._all_views(state)):
+            if view.mask is not None and view.mask.any():
+                legal[row] = torch.from_numpy(view.mask)
+        return legal
+
+    def terminated(self, state: Tensor) -> Tensor:
+        """Where the episode has ended, or no action is legal."""
+        with keep_global_generators():
+            return torch.tensor([self._is_over(handle) for handle in state.tolist()], dtype=torch.bool)
+
+    def check_state(self, state: Tensor) -> None:
+        if not isinstance(state, Tensor) or state.dim() != 1 or state.dtype != torch.long:
+            raise ValueError("`state` must be int64 of shape [B], such as reset and state_of return")
+        check_range("state", state, len(self._store), "states so far")
+
+    def _draw_seeds(self, shape: tuple[int, ...], generator: torch.Generator | None) -> Tensor:
+        """A seed for each plan; all 0 in a deterministic world."""
+        if not self.stochastic:
+            return torch.zeros(shape, dtype=torch.long)
+        return torch.randint(2**62, shape, generator=generator_on(generator, "cpu"))
+
+    def _pin(self, start: Start) -> int:
+        """The number of a state that cannot be reached again, so that its copy is kept."""
+        handle = self._store.add_start(-1 - len(self._pinned))
+        self._pinned[handle], self._pinned_views[handle] = start
+        return handle
+
+    def _take(self, start: int, action: int, seed: int) -> tuple[int, float]:
+        """The state after one action, and its reward."""
+        handle = self._store.find(start, [action], seed)
+        if handle is None:
+            view = None if self.all_legal else self._view(start)
+            if view is not None and view.mask is not None and not view.mask[action]:
+                return start, 0.0
+            simulator = self._load(start)
+            path, handle = self._advance(simulator, start, action, seed)
+            self._keep(handle, simulator, (start, [action], seed))
+        return handle, self._store.reward(handle)
+
+    def _advance(self, simulator: Any, start: int, action: int, seed: int) -> tuple[Path, int]:
+        self._seed(simulator, seed)
+        path = self._driver.follow(simulator, [action], View(None, None))
+        handle = self._store.add(start, [action], seed, path.rewards[0], path.ended)
+        self._views.put(handle, path.views[0])
+        return path, handle
+
+    def _follow(self, start: int, keys: list[tuple[int, ...]], keep_states: bool) -> list[Path]:
+        """The paths of plans, each of which is followed by its seed."""
+        plans, seeds = [list(key[:-1]) for key in keys], [key[-1] if self._draws else None for key in keys]
+        wanted = not self.all_legal or (keep_states and self.observation is not None)
+        view = self._view(start) if wanted else None
+        snapshot = self._snapshot(start)
+        if self._workers is None or isinstance(self._copier, ReplayCopier):
+            return follow_plans(self._driver, self._copier, snapshot, view, plans, seeds)
+        from joblib import Parallel, delayed
+
+        parts = [slice(n, None, self._workers) for n in range(self._workers)]
+        copier, sent = self._copier.to_process(snapshot)
+        shared = Parallel(self._workers)(
+            delayed(follow_plans)(self._driver, copier, sent, view, plans[part], seeds[part]) for part in parts
+        )
+        paths: list[Path] = [None] * len(keys)  # type: ignore[list-item]
+        for part, found in zip(parts, shared, strict=True):
+            paths[part] = found
+        return paths
+
+    def _number_path(self, start: int, path: Path, seed: int, length: int) -> list[int]:
+        """The state after each of the actions of a plan."""
+        counts = path.counts or range(1, len(path.rewards) + 1)
+        handles = []
+        for t, count in enumerate(counts):
+            ended = path.ended and t == len(path.rewards) - 1
+            handles.append(self._store.add(start, path.taken[:count], seed, path.rewards[t], ended))
+            if path.views:
+                self._views.put(handles[-1], path.views[t])
+        return handles + handles[-1:] * (length - len(handles))
+
+    def _is_over(self, handle: int) -> bool:
+        """Whether an episode has ended in a state, or nothing is legal there."""
+        if self._store.ended(handle):
+            return True
+        if self.all_legal or self._store.start_seed(handle) is None:
+            return False
+        mask = self._view(handle).mask
+        return mask is not None and not mask.any()
+
+    def _all_views(self, state: Tensor) -> list[View]:
+        with keep_global_generators():
+            return [self._view(handle) for handle in state.tolist()]
+
+    def _view(self, handle: int) -> View:
+        """What can be seen and done in a state."""
+        view = self._pinned_views.get(handle)
+        view = self._views.use(handle) if view is None else view
+        if view is None:
+            self._reach(handle)
+            view = self._views[handle]
+        return view
+
+    def _snapshot(self, handle: int) -> Any:
+        """A copy of the simulator in a state."""
+        snapshot = self._pinned.get(handle)
+        snapshot = self._snapshots.use(handle) if snapshot is None else snapshot
+        if snapshot is None:
+            self._reach(handle)
+            snapshot = self._snapshots[handle]
+        return snapshot
+
+    def _load(self, handle: int) -> Any:
+        """A simulator in a state, to be stepped."""
+        return self._copier.load(self._snapshot(handle))
+
+    def _keep(self, handle: int, simulator: Any, origin: tuple[int, list[int], int]) -> None:
+        """Keep the copy of a simulator that is not stepped any more."""
+        start, actions, seed = origin
+        saved = self._copier.save(simulator, (self._snapshot(start), actions, seed))
+        self._snapshots.put(handle, saved)
+
+    def _reach(self, handle: int) -> None:
+        """Reach a state again, and keep its copy and its view."""
+        chain = [handle]
+        while self._store.start_seed(chain[-1]) is None:
+            before = self._store.before(chain[-1], self._snapshots)[0]
+            if before in self._pinned or before in self._snapshots:
+                break
+            chain.append(before)
+        for at in reversed(chain):
+            seed = self._store.start_seed(at)
+            if seed is not None:
+                start = make_start(self._driver, self._copier, self._make, seed)
+                self._snapshots.put(at, start.saved)
+                self._views.put(at, start.view)
+                continue
+            earlier, actions, noise_seed = self._store.before(at, self._snapshots)
+            simulator = self._load(earlier)
+            self._seed(simulator, noise_seed)
+            for action in actions[:-1]:
+                simulator.step(action + self._driver.first_action)
+            observation, _, _, info = self._driver.take(simulator, actions[-1])
+            self._views.put(at, self._driver.view(simulator, observation, info))
+            self._keep(at, simulator, (earlier, actions, noise_seed))
+
+    def _seed(self, simulator: Any, seed: int) -> None:
+        if self._draws:
+            seed_generators(self._copier.generators(simulator), seed)
+
+
+def from_simulator(
+    simulator: Any,
+    num_actions: int | None = None,
+    *,
+    clone: Callable[[Any], Any] | None = None,
+    legal_actions: Callable[[Any], Any] | None = None,
+    observe: Callable[[Any], Any] | Literal["observation"] | None = None,
+    observation: Categories | Features | None = None,
+    objective: Literal["terminal", "return"] = "return",
+    discount: float = 1.0,
+    stochastic: bool | None = None,
+    workers: int | None = None,
+    action_names: Sequence[str] | None = None,
+    seed: int = 0,
+) -> SimulatorWorld:
+    """A simulator of any kind as a world: planners try their plans in copies of it.
+
+    A simulator has a method `step(action)`, which returns an observation, a reward and whether the episode has ended,
+    or Gymnasium's five. It is copied by `clone`, else by its method `clone()`, else by `get_state()` and
+    `set_state(state)`, else by pickle or `copy.deepcopy`. The simulator itself is never stepped, reset or changed.
+
+    Planning begins at its present state, which `world.reset` returns. After each step of a running simulator,
+    `world.state_of(simulator)` is the state to plan from.
+
+    Copies are tried out: on random walks they must behave as the simulator does. Where other random numbers change
+    what happens, the world is stochastic. Then each candidate plan meets noise of its own, drawn by the generator that
+    a planner is given. Noise must come from generators that the simulator holds (of numpy, `random` or torch, however
+    deep), or from the modules' own.
+
+    Args:
+        simulator: an object, a list of them (several starts), or a function without arguments that makes one. Of a
+            function each start is a new simulator; its `reset` is called, with `seed=` if it takes one. So it is with a
+            Gymnasium environment that was never reset.
+        num_actions: actions are numbered from 0; None: as many as the `action_space` has.
+        clone: a function from a simulator to an independent copy.
+        legal_actions: a function from a simulator to bool `[A]`. None: by its method `action_masks()` or
+            `action_mask()`, or by `action_mask` in the info of the last step (which is not known before the first
+            step: then all are legal). Where none is legal the episode is over.
+        observe: a function from a simulator to what is observed, or "observation": what `step` returned last.
+        observation: what `observe` returns, `Categories(number)` or `Features(size)`.
+        objective, discount: what counts in this world; see `Planner`.
+        stochastic: whether the same actions may lead to something else; None: this is tried out.
+        workers: so many processes share the plans of a start; worth it for steps of milliseconds. None: this process.
+        action_names: A names.
+        seed: of the walks on which the simulator is tried out.
+
+    Raises:
+        ValueError: the simulator cannot be copied, its copies share a state, its noise cannot be seeded, or an argument
+            is wrong.
+
+    Example:
+        >>> class Walk:
+        ...     place = 0
+        ...
+        ...     def step(self, action):
+        ...         self.place += 2 * action - 1
+        ...         return None, float(self.place == 3), self.place == 3
+        >>> world = from_simulator(Walk(), 2)
+        >>> world.rollout(world.reset(1), torch.ones(1, 1, 4, dtype=torch.long)).rewards.tolist()
+        [[[0.0, 0.0, 1.0, 0.0]]]
+    """
+    world = build_world(
+        simulator,
+        num_actions,
+        seeds=None,
+        clone=clone,
+        legal_actions=legal_actions,
+        observe=observe,
+        observation=observation,
+        stochastic=stochastic,
+        workers=workers,
+        seed=seed,
+    )
+    world.objective, world.discount = objective, discount
+    if action_names is not None and len(action_names) != world.num_actions:
+        raise ValueError(f"`action_names` must have {world.num_actions} names, got {len(action_names)}")
+    world.action_names = None if action_names is None else tuple(action_names)
+    return world
+
+
+def build_world(
+    simulator: Any,
+    num_actions: int | None,
+    *,
+    seeds: Sequence[int] | None,
+    clone: Callable[[Any], Any] | None = None,
+    legal_actions: Callable[[Any], Any] | None = None,
+    observe: Callable[[Any], Any] | Literal["observation"] | None = None,
+    observation: Categories | Features | None = None,
+    transform: Callable[[Any], Any] = lambda observation: observation,
+    stochastic: bool | None = None,
+    workers: int | None = None,
+    seed: int = 0,
+    prepare: Callable[[Any], Any] = lambda simulator: simulator,
+) -> SimulatorWorld:
+    """`from_simulator`, with starts made by these `seeds`, and observations and simulators changed by functions."""
+    if workers is not None:
+        check_sizes(workers=workers)
+    if (observe is None) != (observation is None):
+        raise ValueError("`observe` and `observation` must be given together: what is observed, and what it is")
+    with keep_global_generators():
+        seed_generators([], seed)
+        originals, factory = _sort(simulator, seed)
+        example = originals[0] if originals else factory()
+        number, first = _count_actions(example, num_actions)
+        driver = Driver(number, first, legal_actions, observe, observation, transform)
+        make = None if originals else partial(make_simulator, factory)
+        marks = [fingerprint(one) for one in originals]
+        problem: Exception = ValueError("`simulator` must have copies")
+        for copier in _copiers(example, clone, make, first):
+            try:
+                if make is None:
+                    starts = [enter(driver, copier, one, None, None) for one in originals]
+                else:
+                    starts = [make_start(driver, copier, make, one) for one in seeds or (seed, seed + 1)]
+                    require_same_starts(driver, copier, starts[0], make_start(driver, copier, make, (seeds or (seed,))[0]))
+                noise = try_out(driver, copier, starts, seed, stochastic is None)
+            except Exception as error:  # a simulator may fail to be copied in any way of its own
+                problem = error
+                continue
+            if [fingerprint(one) for one in originals] != marks:
+                raise ValueError("`simulator` must have copies that share nothing with it: stepping one changed it")
+            noise = noise if stochastic is None else Noise(stochastic, noise.draws or stochastic)
+            kept = starts if make is None or seeds is not None else []
+            return SimulatorWorld(driver, copier, noise, make, kept, workers, prepare)
+    if isinstance(problem, ValueError):
+        raise problem
+    raise ValueError(f"`simulator` must have copies; {type(problem).__name__}: {problem}".splitlines()[0]) from problem
+
+
+def enter(driver: Driver, copier: Copier, simulator: Any, observation: Any, info: Any, seed: int = 0) -> Start:
+    """The present state of a simulator, which stays as it is, as a start.
+
+    Raises:
+        ValueError: it has no method `step`.
+    """
+    if not callable(getattr(simulator, "step", None)):
+        raise ValueError(f"`simulator` must have a method `step`, got {kind_of(simulator)}")
+    saved = copier.enter(simulator, seed)
+    simulator = copier.load(saved)
+    driver.find_masks(simulator, info)
+    return Start(saved, driver.view(simulator, observation, info))
+
+
+def make_start(driver: Driver, copier: Copier, make: Callable[[int], tuple[Any, Any, Any]], seed: int) -> Start:
+    """A start that a seed makes."""
+    return enter(driver, copier, *make(seed), seed)
+
+
+def _sort(simulator: Any, seed: int) -> tuple[list[Any], Callable[[], Any]]:
+    """The simulators whose present states are starts; or none, and the function that makes them."""
+    several = list(simulator) if isinstance(simulator, list | tuple) else [simulator]
+    if not several:
+        raise ValueError("`simulator` must be one or more simulators, got none")
+    single = several[0]
+    if not isinstance(single, type) and callable(getattr(single, "step", None)):
+        if len(several) == 1 and not _was_reset(single):
+            return [], partial(copy.deepcopy, single)
+        return several, lambda: None
+    if len(several) > 1 or not callable(single):
+        raise ValueError(
+            f"`simulator` must be an object with a method `step`, or a function that makes one, got {kind_of(single)}"
+        )
+    return [], single
+
+
+def _was_reset(simulator: Any) -> bool:
+    """Whether a simulator can be stepped; a Gymnasium environment only after its reset."""
+    if not hasattr(simulator, "unwrapped") or not hasattr(simulator, "action_space"):
+        return True
+    layer = simulator
+    while layer is not None:
+        if getattr(layer, "_has_reset", True) is False:
+            return False
+        layer = vars(layer).get("env")
+    try:
+        copied = copy.deepcopy(simulator)
+        copied.step(int(getattr(simulator.action_space, "start", 0)))
+    except Exception:
+        return False
+    return True
+
+
+def _count_actions(simulator: Any, num_actions: int | None) -> tuple[int, int]:
+    """The number of actions, and the number of the first in the simulator."""
+    space = getattr(simulator, "action_space", None)
+    if num_actions is None and space is not None:
+        if type(space).__name__ != "Discrete":
+            raise ValueError(f"`simulator` must have discrete actions, got those of the space {space}")
+        return int(space.n), int(space.start)
+    check_sizes(num_actions=num_actions)
+    assert num_actions is not None
+    return num_actions, int(getattr(space, "start", 0))
+
+
+def _copiers(simulator: Any, clone: Any, make: Any, first_action: int) -> Iterator[Copier]:
+    """The ways in which a simulator may be copied, those of its own alone where it has any."""
+    if clone is not None or callable(getattr(simulator, "clone", None)):
+        yield CloneCopier(clone if clone is not None else methodcaller("clone"))
+    elif callable(getattr(simulator, "get_state", None)) and callable(getattr(simulator, "set_state", None)):
+        yield StateCopier(copy.deepcopy(simulator), deep=False)
+        yield StateCopier(copy.deepcopy(simulator), deep=True)
+    else:
+        if not hasattr(simulator, "__deepcopy__"):
+            yield PickleCopier()
+        yield DeepCopier()
+        if make is not None:
+            yield ReplayCopier(lambda seed: make(seed)[0], first_action)
