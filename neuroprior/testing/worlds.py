@@ -11,7 +11,7 @@ from torch import Tensor
 from neuroprior._checks import is_integer
 from neuroprior.testing.chi_square import alike
 from neuroprior.testing.rules import FALSE_ALARM, WORLD_CHECKS, check_by_kind, raises, require, same
-from neuroprior.worlds import TabularWorld, World
+from neuroprior.worlds import SimulatorWorld, TabularWorld, World
 
 Simulator = Any
 """A world, of numbered actions or of vectors."""
@@ -202,6 +202,16 @@ def _check_step(world: Simulator, state: Tensor, action: Tensor, seed: int) -> N
 
 def _check_queries(world: Simulator, state: Tensor) -> None:
     """`observe` and `terminated`."""
+    if not isinstance(world, SimulatorWorld) or world.observation is not None:
+        _check_observation(world, state)
+    ended = world.terminated(state)
+    require(isinstance(ended, Tensor), f"terminated must return a tensor, not {type(ended).__name__}")
+    require(ended.dtype == torch.bool and ended.shape == state.shape[:1], f"terminated must be bool [{len(state)}]")
+    _check_batch("terminated", world.terminated, state, ended)
+
+
+def _check_observation(world: Simulator, state: Tensor) -> None:
+    """`observe`."""
     observed = world.observe(state)
     require(isinstance(observed, Tensor), f"observe must return a tensor, not {type(observed).__name__}")
     fits = (is_integer(observed) and observed.dim() in (1, 2)) or (observed.is_floating_point() and observed.dim() == 2)
@@ -212,10 +222,6 @@ def _check_queries(world: Simulator, state: Tensor) -> None:
     )
     require(not observed.isnan().any(), "observe: NaN in the observations")
     _check_batch("observe", world.observe, state, observed)
-    ended = world.terminated(state)
-    require(isinstance(ended, Tensor), f"terminated must return a tensor, not {type(ended).__name__}")
-    require(ended.dtype == torch.bool and ended.shape == state.shape[:1], f"terminated must be bool [{len(state)}]")
-    _check_batch("terminated", world.terminated, state, ended)
 
 
 def _check_choices(world: World, state: Tensor) -> None:
@@ -277,8 +283,9 @@ def _check_distribution(world: Simulator, state: Tensor, plans: Tensor, seed: in
     for t in range(plans.shape[1]):
         now, reward = world.step(now, plans[:, t], generator)
         rewards.append(reward)
-    observed = torch.cat([rollout.final_state.reshape(len(now), -1).double(), rollout.rewards[:, 0].double()], 1)
-    due = torch.cat([now.reshape(len(now), -1).double(), torch.stack(rewards, 1).double()], 1)
+    final = _comparable(world, rollout.final_state[:, 0])
+    observed = torch.cat([final, rollout.rewards[:, 0].double()], 1)
+    due = torch.cat([_comparable(world, now), torch.stack(rewards, 1).double()], 1)
     for column in range(observed.shape[1]):
         p = alike(observed[:, column].cpu(), due[:, column].cpu(), group)
         what = "rewards" if column >= observed.shape[1] - plans.shape[1] else "final states"
@@ -288,3 +295,10 @@ def _check_distribution(world: Simulator, state: Tensor, plans: Tensor, seed: in
         require(
             twice.rewards[:, 0].equal(twice.rewards[:, 1]), "rollout: the same plan twice had different random numbers"
         )
+
+
+def _comparable(world: Simulator, state: Tensor) -> Tensor:
+    """What `state [N, ...]` says by itself, float64 `[N, K]`: of a simulator's, which are numbered, the observation."""
+    if isinstance(world, SimulatorWorld):
+        state = state[:, None][:, :0] if world.observation is None else world.observe(state)
+    return state.reshape(len(state), -1).double()

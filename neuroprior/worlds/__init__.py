@@ -3,7 +3,7 @@
 from neuroprior.worlds.cube import PocketCube, cube
 from neuroprior.worlds.episodes import EpisodicWorld
 from neuroprior.worlds.grid import GridWorld, egocentric, goal_direction, gridworld, local_view
-from neuroprior.worlds.gymnasium import SteppedWorld, from_gymnasium
+from neuroprior.worlds.gymnasium import from_gymnasium
 from neuroprior.worlds.labyrinth import labyrinth
 from neuroprior.worlds.mazes import four_rooms, maze
 from neuroprior.worlds.observations import Categories, Features
@@ -19,7 +19,6 @@ __all__ = [
     "PocketCube",
     "Rollout",
     "SimulatorWorld",
-    "SteppedWorld",
     "TabularWorld",
     "World",
     "cube",

@@ -14,7 +14,7 @@ class EpisodicWorld(TabularWorld):
     """A `TabularWorld` with start states, absorbing terminal states, and any number of disjoint layouts.
 
     Args:
-        next_state, reward, action_names, probability: see `TabularWorld`.
+        next_state, reward, action_names, probability, legal_actions: see `TabularWorld`.
         starts: floating point `[S]`: the probability that an episode starts there.
         ended: `[S]` bool: terminal states, in which every action stays, without reward.
         layouts: integers `[S]`: the layout that each state belongs to; None: there is one.
@@ -45,10 +45,11 @@ class EpisodicWorld(TabularWorld):
         ended: Tensor,
         *,
         probability: Tensor | None = None,
+        legal_actions: Tensor | None = None,
         layouts: Tensor | None = None,
         features: Tensor | None = None,
     ) -> None:
-        super().__init__(next_state, reward, None, action_names, probability=probability)
+        super().__init__(next_state, reward, legal_actions, action_names, probability=probability)
         for name, table in (("starts", starts), ("ended", ended), ("layouts", layouts), ("features", features)):
             if table is not None and len(table) != self.num_states:
                 raise ValueError(f"`{name}` must be one entry for each of {self.num_states} states, got {len(table)}")

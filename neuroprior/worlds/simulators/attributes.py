@@ -1,5 +1,6 @@
 """Everything that an object holds, however deep, with the path that leads there."""
 
+import math
 from collections import deque
 from collections.abc import Iterator
 from functools import partial
@@ -7,6 +8,10 @@ from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType, Non
 from typing import Any
 
 import numpy as np
+from torch import Tensor
+
+MAX_ELEMENTS = 64
+"""Numbers of an array that are looked at one by one."""
 
 Path = tuple[tuple[bool, Any], ...]
 """Steps from an object inwards: True and an attribute's name, or False and a key."""
@@ -67,6 +72,8 @@ def _children(value: Any) -> Iterator[tuple[tuple[bool, Any], Any]]:
         yield from (((False, at), inner) for at, inner in enumerate(value))
     elif isinstance(value, np.ndarray) and value.dtype == object:
         yield from (((False, at), inner) for at, inner in np.ndenumerate(value))
+    elif isinstance(value, (np.ndarray, Tensor)) and math.prod(value.shape) <= MAX_ELEMENTS:
+        yield from (((False, at), value[at].item()) for at in np.ndindex(*value.shape))
     elif isinstance(value, partial):
         yield from (((True, name), getattr(value, name)) for name in ("func", "args", "keywords"))
     names = dict.fromkeys(getattr(value, "__dict__", ()))

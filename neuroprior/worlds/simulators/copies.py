@@ -49,6 +49,10 @@ class Copier(ABC):
     def generators(self, simulator: Any) -> list[Any]:
         """The generators of a simulator that `load` returned."""
 
+    def text(self, saved: Any) -> bytes:
+        """Bytes that are the same only where all that was saved is the same; empty where there are none."""
+        return b""
+
     def to_process(self, saved: Any) -> tuple["Copier", Any]:
         """A copier for another process, and the simulator that was saved, as that process can load it."""
         return self, saved
@@ -105,10 +109,14 @@ class PickleCopier(_SharingCopier):
         return _Frozen(simulator)
 
     def load(self, saved: Any) -> Any:
+        return self._loads(self.text(saved))
+
+    def text(self, saved: Any) -> bytes:
         if not saved.pickle:
             places = {id(value): path for path, value in self._shared.items()}
             saved.pickle, saved.simulator = _dumps(saved.simulator, places), None
-        return self._loads(saved.pickle)
+        text: bytes = saved.pickle
+        return text
 
     def to_process(self, saved: Any) -> tuple[Copier, Any]:
         """By deepcopy: a pickle names classes, which need not be known by these names in another process."""

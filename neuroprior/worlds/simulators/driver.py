@@ -12,6 +12,8 @@ from neuroprior.worlds.simulators.generators import create_lazy_generators, find
 
 Array = np.ndarray[Any, Any]
 
+RUNNING, TERMINATED, TRUNCATED = 0, 1, 2
+
 MASK_METHODS = ("action_masks", "action_mask")
 
 
@@ -84,8 +86,8 @@ class Driver:
             self.reads_mask = self.legal_actions is not None
         self.has_masks = self.has_masks or self.reads_mask or (isinstance(info, dict) and "action_mask" in info)
 
-    def take(self, simulator: Any, action: int) -> tuple[Any, float, bool, Any]:
-        """Take an action: the observation, the reward, whether the episode has ended, and the info.
+    def take(self, simulator: Any, action: int) -> tuple[Any, float, int, Any]:
+        """Take an action: the observation, the reward, whether and how the episode ended, and the info.
 
         Raises:
             ValueError: `step` returns something else.
@@ -97,7 +99,7 @@ class Driver:
                 f" {len(result) if isinstance(result, tuple) else type(result).__name__}"
             )
         try:
-            ended = bool(result[2]) or (len(result) == 5 and bool(result[3]))
+            ended = TERMINATED if result[2] else TRUNCATED if len(result) == 5 and result[3] else RUNNING
             return result[0], float(result[1]), ended, result[4] if len(result) == 5 else None
         except (TypeError, ValueError) as error:
             raise ValueError(f"`step` must return a number as reward and True or False as end: {error}") from error
@@ -120,8 +122,16 @@ class Driver:
         if self.observe is None:
             return View(None, mask)
         if self.observe == "observation":
-            return View(None if observation is None else self._checked(self.transform(observation)), mask)
+            return View(None if observation is None else self.as_declared(observation), mask)
         return View(self._checked(self.observe(simulator)), mask)
+
+    def end(self, view: View) -> int:
+        """Whether an episode ends where nothing is legal."""
+        return TERMINATED if view.mask is not None and not view.mask.any() else RUNNING
+
+    def as_declared(self, observation: Any) -> Any:
+        """What `step` returned as an observation of this world."""
+        return self._checked(self.transform(observation))
 
     def _checked(self, value: Any) -> Any:
         """An observation as declared: an integer, or float32 `[C]`."""
@@ -148,11 +158,11 @@ class Driver:
             return self._hurry(simulator, actions)
         path = Path([], [], [], [], False)
         for action in actions:
-            reward, ended = 0.0, False
+            reward, ended = 0.0, RUNNING
             if view.mask is None or view.mask[action]:
                 observation, reward, ended, info = self.take(simulator, action)
                 view = self.view(simulator, observation, info)
-                ended = ended or (view.mask is not None and not view.mask.any())
+                ended = ended or self.end(view)
                 path.taken.append(action)
             path.rewards.append(reward)
             path.counts.append(len(path.taken))

@@ -33,13 +33,13 @@ class Noise(NamedTuple):
     draws: bool
 
 
-class _Moment(NamedTuple):
+class Moment(NamedTuple):
     """What one step gave, as far as it can be compared."""
 
     action: int
     observation: bytes
     reward: float
-    ended: bool
+    ended: int
     mask: bytes
 
 
@@ -62,25 +62,27 @@ def try_out(driver: Driver, copier: Copier, starts: Sequence[Start], seed: int, 
         start = starts[walk % len(starts)]
         first_seed, second_seed, other_seed = (int(value) for value in draw.integers(2**62, size=3))
         before = fingerprint(copier.load(start.saved))
-        simulator, states = _load(copier, start.saved, first_seed)
-        moments, view = _walk(driver, simulator, start.view, walk * WALK_LENGTH // (2 * NUM_WALKS), draw)
+        simulator = load_seeded(copier, start.saved, first_seed)
+        states = state_of_generators(copier.generators(simulator))
+        moments, view = random_walk(driver, simulator, start.view, walk * WALK_LENGTH // (2 * NUM_WALKS), draw)
         saved = copier.save(simulator, (start.saved, [moment.action for moment in moments], first_seed))
         draws = draws or states != state_of_generators(copier.generators(simulator))
         if moments and moments[-1].ended:
             continue
-        simulator, states = _load(copier, saved, second_seed)
-        after, _ = _walk(driver, simulator, view, WALK_LENGTH - len(moments), draw)
+        simulator = load_seeded(copier, saved, second_seed)
+        states = state_of_generators(copier.generators(simulator))
+        after, _ = random_walk(driver, simulator, view, WALK_LENGTH - len(moments), draw)
         draws = draws or states != state_of_generators(copier.generators(simulator))
         if fingerprint(copier.load(start.saved)) != before:
             raise ValueError("`simulator` must have copies that share nothing with it: stepping one changed another")
         actions = [moment.action for moment in moments], [moment.action for moment in after]
         again = _follow(driver, copier, saved, view, actions[1], second_seed)
         _require_equal(after, again, SEEDED)
-        simulator, _ = _load(copier, start.saved, first_seed)
-        whole, _ = _follow_on(driver, simulator, start.view, actions[0])
+        simulator = load_seeded(copier, start.saved, first_seed)
+        whole, _ = follow_on(driver, simulator, start.view, actions[0])
         _require_equal(moments, whole, SEEDED)
         seed_generators(copier.generators(simulator), second_seed)
-        rest, _ = _follow_on(driver, simulator, view, actions[1])
+        rest, _ = follow_on(driver, simulator, view, actions[1])
         _require_equal(after, rest, "have copies that behave as it does")
         if look_for_noise and not stochastic:
             stochastic = _follow(driver, copier, saved, view, actions[1], other_seed) != after
@@ -88,8 +90,8 @@ def try_out(driver: Driver, copier: Copier, starts: Sequence[Start], seed: int, 
     while look_for_noise and draws and not stochastic and steps < EXTRA_STEPS:
         start = starts[steps % len(starts)]
         first_seed, other_seed = (int(value) for value in draw.integers(2**62, size=2))
-        simulator, _ = _load(copier, start.saved, first_seed)
-        moments, _ = _walk(driver, simulator, start.view, 4 * WALK_LENGTH, draw)
+        simulator = load_seeded(copier, start.saved, first_seed)
+        moments, _ = random_walk(driver, simulator, start.view, 4 * WALK_LENGTH, draw)
         actions = [moment.action for moment in moments]
         stochastic = _follow(driver, copier, start.saved, start.view, actions, other_seed) != moments
         steps += len(moments) + 1
@@ -98,34 +100,33 @@ def try_out(driver: Driver, copier: Copier, starts: Sequence[Start], seed: int, 
 
 def require_same_starts(driver: Driver, copier: Copier, first: Start, second: Start) -> None:
     """Raise ValueError unless two simulators that were made by the same seed behave alike."""
-    simulator, _ = _load(copier, first.saved, 0)
-    moments, _ = _walk(driver, simulator, first.view, WALK_LENGTH, np.random.default_rng(0))
+    simulator = load_seeded(copier, first.saved, 0)
+    moments, _ = random_walk(driver, simulator, first.view, WALK_LENGTH, np.random.default_rng(0))
     actions = [moment.action for moment in moments]
     again = _follow(driver, copier, second.saved, second.view, actions, 0)
     _require_equal(moments, again, SEEDED)
 
 
-def _load(copier: Copier, saved: Any, seed: int) -> tuple[Any, list[str]]:
-    """A copy with seeded generators, and their states."""
+def load_seeded(copier: Copier, saved: Any, seed: int) -> Any:
+    """A copy whose generators are seeded."""
     simulator = copier.load(saved)
-    generators = copier.generators(simulator)
-    seed_generators(generators, seed)
-    return simulator, state_of_generators(generators)
+    seed_generators(copier.generators(simulator), seed)
+    return simulator
 
 
 def _follow(
     driver: Driver, copier: Copier, saved: Any, view: View, actions: Sequence[int], seed: int
-) -> list[_Moment]:
+) -> list[Moment]:
     """What a copy gives for these actions under the noise of a seed."""
-    simulator, _ = _load(copier, saved, seed)
-    return _follow_on(driver, simulator, view, actions)[0]
+    simulator = load_seeded(copier, saved, seed)
+    return follow_on(driver, simulator, view, actions)[0]
 
 
-def _follow_on(
+def follow_on(
     driver: Driver, simulator: Any, view: View, actions: Sequence[int]
-) -> tuple[list[_Moment], View]:
+) -> tuple[list[Moment], View]:
     """What a simulator gives for these actions, without those that are not legal, and the last view."""
-    moments: list[_Moment] = []
+    moments: list[Moment] = []
     for action in actions:
         if view.mask is None or view.mask[action]:
             moment, view = _moment(driver, simulator, action)
@@ -135,11 +136,11 @@ def _follow_on(
     return moments, view
 
 
-def _walk(
+def random_walk(
     driver: Driver, simulator: Any, view: View, length: int, draw: np.random.Generator
-) -> tuple[list[_Moment], View]:
+) -> tuple[list[Moment], View]:
     """What a simulator gives for random legal actions, and the last view."""
-    moments: list[_Moment] = []
+    moments: list[Moment] = []
     for _ in range(length):
         legal = np.arange(driver.num_actions) if view.mask is None else np.flatnonzero(view.mask)
         if not len(legal) or (moments and moments[-1].ended):
@@ -149,7 +150,7 @@ def _walk(
     return moments, view
 
 
-def _moment(driver: Driver, simulator: Any, action: int) -> tuple[_Moment, View]:
+def _moment(driver: Driver, simulator: Any, action: int) -> tuple[Moment, View]:
     """What a step gives, and the view after it."""
     try:
         observation, reward, ended, info = driver.take(simulator, action)
@@ -162,12 +163,11 @@ def _moment(driver: Driver, simulator: Any, action: int) -> tuple[_Moment, View]
         ) from error
     driver.find_masks(simulator, info)
     view = driver.view(simulator, observation, info)
-    ended = ended or (view.mask is not None and not view.mask.any())
     seen = fingerprint([observation, view.observation])
-    return _Moment(action, seen, reward, ended, b"" if view.mask is None else view.mask.tobytes()), view
+    return Moment(action, seen, reward, ended or driver.end(view), b"" if view.mask is None else view.mask.tobytes()), view
 
 
-def _require_equal(first: list[_Moment], second: list[_Moment], rule: str) -> None:
+def _require_equal(first: list[Moment], second: list[Moment], rule: str) -> None:
     """Raise ValueError, with what differs, unless two walks gave the same."""
     for t, (one, other) in enumerate(zip(first, second, strict=False), start=1):
         for name in ("observation", "reward", "ended", "mask"):

@@ -24,6 +24,7 @@ from neuroprior.worlds.simulators.copies import (
 from neuroprior.worlds.simulators.driver import Driver, Path, View, follow_plans, make_simulator
 from neuroprior.worlds.simulators.fingerprints import fingerprint
 from neuroprior.worlds.simulators.generators import keep_global_generators, seed_generators
+from neuroprior.worlds.simulators.readers import Reader, find_reader
 from neuroprior.worlds.simulators.store import Recent, Store
 from neuroprior.worlds.simulators.trials import Noise, Start, require_same_starts, try_out
 from neuroprior.worlds.world import Rollout, World, check_plans, on_cpu
@@ -51,6 +52,7 @@ class SimulatorWorld(World):
     Attributes:
         observation: what `observe` returns: `Categories`, `Features`, or None.
         objective, discount: what counts in this world.
+        driver, copier, starts: as given.
         max_snapshots: the most copies that are kept.
     """
 
@@ -67,13 +69,15 @@ class SimulatorWorld(World):
         self.num_actions, self.observation = driver.num_actions, driver.observation
         self.stochastic, self.all_legal = noise.stochastic, not driver.has_masks
         self.objective, self.discount = "return", 1.0
-        self._driver, self._copier, self._draws, self._make = driver, copier, noise.draws, make
+        self.driver, self.copier, self._draws, self._make = driver, copier, noise.draws, make
         self._workers, self._prepare = workers, prepare
         self._store = Store(self.num_actions, not self.stochastic)
+        self._reader: Reader | None = None
         self._pinned: dict[int, Any] = {}
         self._pinned_views: dict[int, View] = {}
         self._snapshots, self._views = Recent[Any](MAX_SNAPSHOTS), Recent[View](MAX_VIEWS)
-        self._starts = [self._pin(start) for start in starts]
+        self.starts = list(starts)
+        self._start_states = [self._pin(start) for start in starts]
 
     @property
     def max_snapshots(self) -> int:
@@ -96,8 +100,8 @@ class SimulatorWorld(World):
         """
         check_count("batch_size", batch_size)
         generator = generator_on(generator, "cpu")
-        if self._starts:
-            return torch.tensor(self._starts)[torch.randint(len(self._starts), (batch_size,), generator=generator)]
+        if self.starts:
+            return torch.tensor(self._start_states)[torch.randint(len(self.starts), (batch_size,), generator=generator)]
         seeds = torch.randint(2**62, (batch_size,), generator=generator).tolist()
         return torch.tensor([self._store.add_start(seed) for seed in seeds], dtype=torch.long)
 
@@ -114,7 +118,7 @@ class SimulatorWorld(World):
         observations, infos = (list(x) if several and x is not None else [x] * len(each) for x in (observation, info))
         with keep_global_generators():
             found = [
-                self._pin(enter(self._driver, self._copier, self._prepare(one), *seen))
+                self._pin(enter(self.driver, self.copier, self._prepare(one), *seen))
                 for one, *seen in zip(each, observations, infos, strict=True)
             ]
         return torch.tensor(found, dtype=torch.long)
@@ -171,9 +175,8 @@ class SimulatorWorld(World):
         """
         if self.observation is None:
             raise ValueError("`observe` must be given to from_simulator for a world in which something is observed")
-        seen = [view.observation for view in self._all_views(state)]
-        if any(one is None for one in seen):
-            raise ValueError("observation: what was observed last in a running simulator must be given to `state_of`")
+        with keep_global_generators():
+            seen = [self._observation(handle) for handle in state.tolist()]
         if isinstance(self.observation, Categories):
             return torch.tensor(seen, dtype=torch.long)
         return torch.from_numpy(np.array(seen, dtype=np.float32).reshape(len(seen), self.observation.size))
@@ -183,9 +186,11 @@ class SimulatorWorld(World):
         legal = torch.ones(len(state), self.num_actions, dtype=torch.bool)
         if self.all_legal:
             return legal
-        for row, view in enumerate(self._all_views(state)):
-            if view.mask is not None and view.mask.any():
-                legal[row] = torch.from_numpy(view.mask)
+        with keep_global_generators():
+            for row, handle in enumerate(state.tolist()):
+                mask = self._view(handle).mask
+                if mask is not None and mask.any():
+                    legal[row] = torch.from_numpy(mask)
         return legal
 
     def terminated(self, state: Tensor) -> Tensor:
@@ -224,7 +229,7 @@ class SimulatorWorld(World):
 
     def _advance(self, simulator: Any, start: int, action: int, seed: int) -> tuple[Path, int]:
         self._seed(simulator, seed)
-        path = self._driver.follow(simulator, [action], View(None, None))
+        path = self.driver.follow(simulator, [action], View(None, None))
         handle = self._store.add(start, [action], seed, path.rewards[0], path.ended)
         self._views.put(handle, path.views[0])
         return path, handle
@@ -235,14 +240,14 @@ class SimulatorWorld(World):
         wanted = not self.all_legal or (keep_states and self.observation is not None)
         view = self._view(start) if wanted else None
         snapshot = self._snapshot(start)
-        if self._workers is None or isinstance(self._copier, ReplayCopier):
-            return follow_plans(self._driver, self._copier, snapshot, view, plans, seeds)
+        if self._workers is None or isinstance(self.copier, ReplayCopier):
+            return follow_plans(self.driver, self.copier, snapshot, view, plans, seeds)
         from joblib import Parallel, delayed
 
         parts = [slice(n, None, self._workers) for n in range(self._workers)]
-        copier, sent = self._copier.to_process(snapshot)
+        copier, sent = self.copier.to_process(snapshot)
         shared = Parallel(self._workers)(
-            delayed(follow_plans)(self._driver, copier, sent, view, plans[part], seeds[part]) for part in parts
+            delayed(follow_plans)(self.driver, copier, sent, view, plans[part], seeds[part]) for part in parts
         )
         paths: list[Path] = [None] * len(keys)  # type: ignore[list-item]
         for part, found in zip(parts, shared, strict=True):
@@ -269,9 +274,18 @@ class SimulatorWorld(World):
         mask = self._view(handle).mask
         return mask is not None and not mask.any()
 
-    def _all_views(self, state: Tensor) -> list[View]:
-        with keep_global_generators():
-            return [self._view(handle) for handle in state.tolist()]
+    def _observation(self, handle: int) -> Any:
+        """The observation in a state; of a running simulator as far as it can be read from it."""
+        observation = self._view(handle).observation
+        if observation is None:
+            if self._reader is None:
+                start = Start(self._snapshot(handle), self._view(handle))
+                self._reader = find_reader(self.driver, self.copier, start)
+            if self._reader is None:
+                raise ValueError("`state_of` must be given what a running simulator's last step observed; got nothing")
+            observation = self.driver.as_declared(self._reader(self._load(handle)))
+            self._pinned_views[handle] = self._view(handle)._replace(observation=observation)
+        return observation
 
     def _view(self, handle: int) -> View:
         """What can be seen and done in a state."""
@@ -293,12 +307,12 @@ class SimulatorWorld(World):
 
     def _load(self, handle: int) -> Any:
         """A simulator in a state, to be stepped."""
-        return self._copier.load(self._snapshot(handle))
+        return self.copier.load(self._snapshot(handle))
 
     def _keep(self, handle: int, simulator: Any, origin: tuple[int, list[int], int]) -> None:
         """Keep the copy of a simulator that is not stepped any more."""
         start, actions, seed = origin
-        saved = self._copier.save(simulator, (self._snapshot(start), actions, seed))
+        saved = self.copier.save(simulator, (self._snapshot(start), actions, seed))
         self._snapshots.put(handle, saved)
 
     def _reach(self, handle: int) -> None:
@@ -312,7 +326,7 @@ class SimulatorWorld(World):
         for at in reversed(chain):
             seed = self._store.start_seed(at)
             if seed is not None:
-                start = make_start(self._driver, self._copier, self._make, seed)
+                start = make_start(self.driver, self.copier, self._make, seed)
                 self._snapshots.put(at, start.saved)
                 self._views.put(at, start.view)
                 continue
@@ -320,14 +334,14 @@ class SimulatorWorld(World):
             simulator = self._load(earlier)
             self._seed(simulator, noise_seed)
             for action in actions[:-1]:
-                simulator.step(action + self._driver.first_action)
-            observation, _, _, info = self._driver.take(simulator, actions[-1])
-            self._views.put(at, self._driver.view(simulator, observation, info))
+                simulator.step(action + self.driver.first_action)
+            observation, _, _, info = self.driver.take(simulator, actions[-1])
+            self._views.put(at, self.driver.view(simulator, observation, info))
             self._keep(at, simulator, (earlier, actions, noise_seed))
 
     def _seed(self, simulator: Any, seed: int) -> None:
         if self._draws:
-            seed_generators(self._copier.generators(simulator), seed)
+            seed_generators(self.copier.generators(simulator), seed)
 
 
 def from_simulator(
