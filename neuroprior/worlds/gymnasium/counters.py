@@ -3,9 +3,11 @@
 import copy
 import itertools
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from neuroprior.worlds.simulators.attributes import Path, name_path, read, walk, write
 from neuroprior.worlds.simulators.copies import Copier
@@ -50,12 +52,6 @@ class Counters:
         self._values = {path: copy.deepcopy(read(copier.load(start.saved), path)) for path in growing}
         idle = [path for path in growing if self._is_idle([path])]
         idle = idle if self._is_idle(idle) else []
-        kept = [path for path in growing if path not in idle]
-        if kept and self._is_endless(kept[0]):
-            raise ValueError(
-                f"env: `{name_path(kept[0])}` grows with each step and changes what happens, so that there is no end of"
-                ' states; use method="step"'
-            )
         self.names = [name_path(path) for path in idle]
         self.changes_rewards = bool(idle)
         for path, value in walk(copier.load(start.saved)):
@@ -63,6 +59,12 @@ class Counters:
                 idle.append(path)
                 self._values[path] = value
         self._paths = idle
+        endless = self._find_endless()
+        if endless is not None:
+            raise ValueError(
+                f"env: `{name_path(endless)}` changes with each step, and what happens depends on it or it cannot be set"
+                ' back, so that there is no end of states; use method="step"'
+            )
 
     def set_back(self, simulator: Any) -> None:
         """Set what grows to what it was at the start of the episode."""
@@ -77,7 +79,7 @@ class Counters:
             write(simulator, path, copy.deepcopy(self._values[path]))
 
     def _find_growing(self) -> list[Path]:
-        """The paths of what grows with each step, by as much whatever the actions."""
+        """The paths of what grows or shrinks with each step, by as much whatever the actions."""
         simulator = self._copier.load(self._start.saved)
         paths = [path for path, value in walk(simulator) if path and _size(value) is not None]
         longest: dict[Path, tuple[float, ...]] = {}
@@ -92,7 +94,7 @@ class Counters:
             paths = [
                 path
                 for path, column in columns.items()
-                if all(a < b for a, b in itertools.pairwise(column))
+                if _is_monotone(column)
                 and all(a == b for a, b in zip(column, longest.get(path, column), strict=False))
             ]
             longest = {path: max(columns[path], longest.get(path, ()), key=len) for path in paths}
@@ -121,10 +123,10 @@ class Counters:
                 return False
         return True
 
-    def _is_endless(self, path: Path) -> bool:
-        """Whether something still grows on a long walk that avoids the ends of episodes."""
-        saved, view, size = self._start.saved, self._start.view, -np.inf
-        for _ in range(ENDLESS_STEPS):
+    def _find_endless(self) -> Path | None:
+        """What still grows or shrinks with each step of a long walk that avoids the ends of episodes; None: nothing."""
+        saved, view, sizes = self._start.saved, self._start.view, list[dict[Path, float]]()
+        for step in range(ENDLESS_STEPS):
             legal = np.arange(self._driver.num_actions) if view.mask is None else np.flatnonzero(view.mask)
             for action in self._draw.permutation(legal).tolist():
                 simulator = self._copier.load(saved)
@@ -132,21 +134,27 @@ class Counters:
                 if not moments[0].ended:
                     break
             else:
-                return False
-            grown = _sizes(simulator, [path])[0]
-            if not grown > size:
-                return False
-            size, view = grown, after
-            saved = self._copier.save(simulator, (saved, [action], 0))
-        return True
+                return None
+            self.set_back(simulator)
+            if step >= ENDLESS_STEPS - WALK_LENGTH:
+                sizes.append({path: size for path, one in walk(simulator) if (size := _size(one)) is not None})
+            view, saved = after, self._copier.save(simulator, (saved, [action], 0))
+        columns = ((path, [held.get(path, np.nan) for held in sizes]) for path in sizes[0])
+        return next((path for path, column in columns if _is_monotone(column)), None)
+
+
+def _is_monotone(sizes: Sequence[float]) -> bool:
+    """Whether each size is above the one before, or each below."""
+    pairs = list(itertools.pairwise(sizes))
+    return all(a < b for a, b in pairs) or all(a > b for a, b in pairs)
 
 
 def _size(value: Any) -> float | None:
     """A number, or how much a collection holds; None for anything else."""
     if isinstance(value, CONTAINERS):
         return len(value) if not isinstance(value, np.ndarray) or value.ndim else None
-    if isinstance(value, (int, float, np.number)) and not isinstance(value, bool):
-        return float(value)
+    if isinstance(value, (int, float, np.number, Tensor)) and not isinstance(value, bool):
+        return float(value) if not isinstance(value, Tensor) or not value.ndim else None
     return None
 
 

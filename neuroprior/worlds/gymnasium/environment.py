@@ -24,7 +24,7 @@ def open_environment(env: Any, options: dict[str, Any]) -> tuple[Any, Callable[[
     """The environment without its time limits and checks, and a function that makes others of its kind.
 
     Args:
-        env: an instance, which stays as it is, or a name.
+        env: an instance, which stays as it is, a name, or a function.
         options: how one is made from its name.
 
     Raises:
@@ -35,13 +35,19 @@ def open_environment(env: Any, options: dict[str, Any]) -> tuple[Any, Callable[[
     if isinstance(env, str):
         make = partial(_make, env, options)
         opened = make()
-    elif not isinstance(env, gymnasium.Env):
-        raise ValueError(f"`env` must be the name of an environment or a gymnasium.Env, got {type(env).__name__}")
     elif options:
         raise ValueError(f"{next(iter(options))}: options make an environment from its name; this one is made already")
-    else:
+    elif isinstance(env, gymnasium.Env):
         opened = without_limits(env)
         make = partial(copy.deepcopy, opened)
+    else:
+        opened = without_limits(env()) if callable(env) else env
+        make = partial(_call, env)
+    if not isinstance(opened, gymnasium.Env):
+        raise ValueError(
+            "`env` must be the name of an environment, a gymnasium.Env or a function that makes one, got"
+            f" {type(env).__name__}"
+        )
     if not isinstance(opened.action_space, gymnasium.spaces.Discrete):
         raise ValueError(f"`env` must have discrete actions, got those of the space {opened.action_space}")
     return opened, make
@@ -67,6 +73,10 @@ def _make(name: str, options: dict[str, Any]) -> Any:
         return without_limits(gymnasium.make(name, disable_env_checker=True, **options))
     except (gymnasium.error.Error, ImportError, TypeError, ValueError, AssertionError) as error:
         raise ValueError(f"env: {name} cannot be made: {' '.join(str(error).split())[:200]}") from error
+
+
+def _call(make: Callable[[], Any]) -> Any:
+    return without_limits(make())
 
 
 def without_limits(env: Any) -> Any:

@@ -182,7 +182,10 @@ class _Search:
         raw = (layout, hashlib.blake2b(text, digest_size=16).digest(), ended)
         if text and raw in self._raw:
             return self._raw[raw]
-        key = (layout, digest(simulator), ended)
+        try:
+            key = (layout, digest(simulator), ended)
+        except ValueError as error:
+            raise ValueError(f'env: {error}; use method="step"') from error
         number = self._numbers.setdefault(key, len(self._numbers))
         if text:
             self._raw[raw] = number

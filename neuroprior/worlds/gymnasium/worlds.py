@@ -64,7 +64,7 @@ def from_gymnasium(
     removed: plans have a length of their own.
 
     Args:
-        env: the name of an environment, or a `gymnasium.Env`, which is copied.
+        env: the name of an environment, a `gymnasium.Env`, which is copied, or a function that makes one.
         method: see above.
         max_states: for "enumerate": the most states that may be found.
         starts: for tables: "initial": `reset` draws the initial states of episodes; "any": any reachable state that is
@@ -132,7 +132,8 @@ def from_gymnasium(
             return table.start_anywhere() if starts == "any" else table
     if starts == "any":
         raise ValueError('starts: "any" needs a table of all states, which method="step" does not have')
-    return build(make if seeds is not None or isinstance(env, str) else opened, None if seeds is None else chosen)
+    running = seeds is None and hasattr(env, "step") and not isinstance(env, type)
+    return build(opened if running else make, None if seeds is None else chosen)
 
 
 def _starts_alike(world: SimulatorWorld, other: SimulatorWorld) -> bool:

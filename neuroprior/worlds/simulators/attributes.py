@@ -76,6 +76,7 @@ def _children(value: Any) -> Iterator[tuple[tuple[bool, Any], Any]]:
         yield from (((False, at), value[at].item()) for at in np.ndindex(*value.shape))
     elif isinstance(value, partial):
         yield from (((True, name), getattr(value, name)) for name in ("func", "args", "keywords"))
+        return
     names = dict.fromkeys(getattr(value, "__dict__", ()))
     for base in type(value).__mro__:
         slots = vars(base).get("__slots__", ())

@@ -1,8 +1,10 @@
 """Ways to copy a simulator: by a method of its own, by pickle, by `copy.deepcopy`."""
 
 import copy
+import copyreg
 import io
 import pickle
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from types import ModuleType
@@ -114,7 +116,7 @@ class PickleCopier(_SharingCopier):
     def text(self, saved: Any) -> bytes:
         if not saved.pickle:
             places = {id(value): path for path, value in self._shared.items()}
-            saved.pickle, saved.simulator = _dumps(saved.simulator, places), None
+            saved.pickle, saved.simulator = _dumps(saved.simulator, places, self._kinds()), None
         text: bytes = saved.pickle
         return text
 
@@ -125,36 +127,35 @@ class PickleCopier(_SharingCopier):
         return copier, self.load(saved)
 
     def _copy(self, simulator: Any, places: dict[int, Path]) -> Any:
-        return self._loads(_dumps(simulator, places))
+        return self._loads(_dumps(simulator, places, self._kinds()))
+
+    def _kinds(self) -> set[type]:
+        return {type(value) for value in self._shared.values()}
 
     def _loads(self, text: bytes) -> Any:
-        reader = _Reader(io.BytesIO(text))
-        reader.shared = self._shared
-        return reader.load()
+        _reading.shared = self._shared
+        return pickle.loads(text)
 
 
-class _Reader(pickle.Unpickler):
-    shared: dict[Path, Any]
-
-    def persistent_load(self, place: Any) -> Any:
-        return self.shared[place]
+_reading = threading.local()
+"""What is shared by the copies that a thread makes."""
 
 
-class _Writer(pickle.Pickler):
-    places: dict[int, Path]
-
-    def persistent_id(self, value: Any) -> Path | None:
-        return self.places.get(id(value))
+def _shared_at(path: Path) -> Any:
+    """What stands in place of a generator or module when a pickle is read."""
+    return _reading.shared[path]
 
 
-def _dumps(simulator: Any, places: dict[int, Path]) -> bytes:
+def _dumps(simulator: Any, places: dict[int, Path], kinds: set[type]) -> bytes:
+    """A pickle in which what stands at these addresses is named by its path; it is of these kinds."""
+
+    def reduce(value: Any) -> Any:
+        return (_shared_at, (places[id(value)],)) if id(value) in places else value.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
+
     file = io.BytesIO()
-    if places:
-        writer = _Writer(file, pickle.HIGHEST_PROTOCOL)
-        writer.places = places
-        writer.dump(simulator)
-    else:
-        pickle.dump(simulator, file, pickle.HIGHEST_PROTOCOL)
+    pickler = pickle.Pickler(file, pickle.HIGHEST_PROTOCOL)
+    pickler.dispatch_table = copyreg.dispatch_table | dict.fromkeys(kinds, reduce)
+    pickler.dump(simulator)
     return file.getvalue()
 
 

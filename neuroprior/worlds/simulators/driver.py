@@ -82,7 +82,9 @@ class Driver:
     def find_masks(self, simulator: Any, info: Any) -> None:
         """Find out where masks come from: a method of `simulator`, or its `info`."""
         if self.legal_actions is None:
-            self.legal_actions = next((_Method(name) for name in MASK_METHODS if _Method(name).of(simulator)), None)
+            self.legal_actions = next(
+                (_Method(name) for name in MASK_METHODS if _Method(name).of(simulator) is not None), None
+            )
             self.reads_mask = self.legal_actions is not None
         self.has_masks = self.has_masks or self.reads_mask or (isinstance(info, dict) and "action_mask" in info)
 
@@ -190,13 +192,20 @@ class _Method:
         self.name = name
 
     def of(self, simulator: Any) -> Any:
-        """The method, or None."""
+        """The method, or None where there is none that needs no arguments."""
         inner = getattr(simulator, "unwrapped", simulator)
-        return getattr(simulator, self.name, getattr(inner, self.name, None))
+        value = getattr(simulator, self.name, getattr(inner, self.name, None))
+        return None if callable(value) and needs_arguments(value) else value
 
     def __call__(self, simulator: Any) -> Any:
         value = self.of(simulator)
         return value() if callable(value) else value
+
+
+def needs_arguments(function: Any) -> bool:
+    """Whether a function cannot be called without arguments."""
+    parameters = inspect.signature(function).parameters.values()
+    return any(p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters)
 
 
 def make_simulator(factory: Callable[[], Any], seed: int) -> tuple[Any, Any, Any]:
@@ -215,7 +224,7 @@ def make_simulator(factory: Callable[[], Any], seed: int) -> tuple[Any, Any, Any
         return simulator, None, None
     parameters = inspect.signature(reset).parameters.values()
     seeded = any(p.name == "seed" or p.kind is p.VAR_KEYWORD for p in parameters)
-    if not seeded and any(p.default is p.empty and p.kind is not p.VAR_POSITIONAL for p in parameters):
+    if not seeded and needs_arguments(reset):
         return simulator, None, None
     result = reset(seed=seed % 2**31) if seeded else reset()
     if isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict):
