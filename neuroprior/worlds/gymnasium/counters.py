@@ -23,7 +23,7 @@ ENDLESS_STEPS = 1000
 CONTAINERS = (list, dict, set, deque, str, bytes, np.ndarray)
 
 NOT_STATE = "lastaction"
-"""Gymnasium's toy texts remember the last action, only to draw it."""
+"""Gymnasium's toy texts remember the last action under this name, only to draw it."""
 
 
 class Counters:
@@ -39,7 +39,6 @@ class Counters:
 
     Attributes:
         names: what is set back.
-        changes_rewards: whether rewards may depend on it.
 
     Raises:
         ValueError: something grows with each step without end, and changes what happens; the message names it.
@@ -48,17 +47,13 @@ class Counters:
     def __init__(self, driver: Driver, copier: Copier, start: Start, seed: int) -> None:
         self._driver, self._copier, self._start = driver, copier, start
         self._draw = np.random.default_rng(seed)
-        growing = self._find_growing()
-        self._values = {path: copy.deepcopy(read(copier.load(start.saved), path)) for path in growing}
-        idle = [path for path in growing if self._is_idle([path])]
-        idle = idle if self._is_idle(idle) else []
-        self.names = [name_path(path) for path in idle]
-        self.changes_rewards = bool(idle)
-        for path, value in walk(copier.load(start.saved)):
-            if path and path[-1] == (True, NOT_STATE):
-                idle.append(path)
-                self._values[path] = value
-        self._paths = idle
+        held = list(walk(copier.load(start.saved)))
+        candidates = self._find_growing([path for path, value in held if path and _size(value) is not None])
+        candidates += [path for path, _ in held if path and path[-1] == (True, NOT_STATE)]
+        self._values = {path: copy.deepcopy(read(copier.load(start.saved), path)) for path in candidates}
+        idle = [path for path in candidates if self._is_idle([path])]
+        self._paths = idle if self._is_idle(idle) else []
+        self.names = [name_path(path) for path in self._paths]
         endless = self._find_endless()
         if endless is not None:
             raise ValueError(
@@ -78,10 +73,8 @@ class Counters:
         for path in paths:
             write(simulator, path, copy.deepcopy(self._values[path]))
 
-    def _find_growing(self) -> list[Path]:
-        """The paths of what grows or shrinks with each step, by as much whatever the actions."""
-        simulator = self._copier.load(self._start.saved)
-        paths = [path for path, value in walk(simulator) if path and _size(value) is not None]
+    def _find_growing(self, paths: list[Path]) -> list[Path]:
+        """Those of the paths to what grows or shrinks with each step, by as much whatever the actions."""
         longest: dict[Path, tuple[float, ...]] = {}
         for _ in range(NUM_WALKS):
             simulator, view = self._copier.load(self._start.saved), self._start.view

@@ -114,7 +114,7 @@ class Flattener:
     """
 
     def __init__(self, space: Any) -> None:
-        self._space, self._spaces = space, import_gymnasium().spaces
+        self._space = space
         self.size = len(self(copy.deepcopy(space).sample()))
 
     def __call__(self, observation: Any) -> np.ndarray[Any, Any]:
@@ -122,7 +122,7 @@ class Flattener:
         return self._flatten(self._space, observation)
 
     def _flatten(self, space: Any, observation: Any) -> np.ndarray[Any, Any]:
-        spaces = self._spaces
+        spaces = import_gymnasium().spaces
         if isinstance(space, spaces.Dict):
             parts = [self._flatten(inner, observation[key]) for key, inner in space.spaces.items()]
         elif isinstance(space, spaces.Tuple):

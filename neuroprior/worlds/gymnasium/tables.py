@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 
 from neuroprior.worlds.episodes import EpisodicWorld
 from neuroprior.worlds.gymnasium.counters import NUM_WALKS, WALK_LENGTH, Counters
-from neuroprior.worlds.gymnasium.environment import action_names
+from neuroprior.worlds.gymnasium.environment import action_names, without_limits
 from neuroprior.worlds.simulators.copies import ReplayCopier
 from neuroprior.worlds.simulators.driver import TRUNCATED, View
 from neuroprior.worlds.simulators.fingerprints import digest
@@ -55,8 +56,13 @@ def read_table(env: Any) -> EpisodicWorld:
     starts[:states] = torch.as_tensor(base.initial_state_distrib, dtype=torch.float64)
     names = action_names(env)
     if probability.shape[-1] == 1:
-        return EpisodicWorld(next_state[..., 0], reward[None, ..., 0], names, starts, ended)
-    return EpisodicWorld(next_state, reward[None], names, starts, ended, probability=probability)
+        return EpisodicWorld(next_state[..., 0], reward[None, ..., 0], names, starts, ended, locate=_present)
+    return EpisodicWorld(next_state, reward[None], names, starts, ended, probability=probability, locate=_present)
+
+
+def _present(env: Any) -> int:
+    """The state in which a toy text is."""
+    return int(env.unwrapped.s)
 
 
 def _outcomes(table: Any, actions: int) -> tuple[torch.Tensor, ...]:
@@ -182,10 +188,7 @@ class _Search:
         raw = (layout, hashlib.blake2b(text, digest_size=16).digest(), ended)
         if text and raw in self._raw:
             return self._raw[raw]
-        try:
-            key = (layout, digest(simulator), ended)
-        except ValueError as error:
-            raise ValueError(f'env: {error}; use method="step"') from error
+        key = (layout, self._digest(simulator), ended)
         number = self._numbers.setdefault(key, len(self._numbers))
         if text:
             self._raw[raw] = number
@@ -204,6 +207,27 @@ class _Search:
                 self._waiting[number] = saved
         return number
 
+    def _digest(self, simulator: Any) -> bytes:
+        try:
+            return digest(simulator)
+        except ValueError as error:
+            raise ValueError(f'env: {error}; use method="step"') from error
+
+    def locate(self, env: Any) -> int:
+        """The number of the state in which an environment is, which stays as it is.
+
+        Raises:
+            ValueError: the table has no such state.
+        """
+        with keep_global_generators():
+            simulator = self.copier.load(self.copier.enter(without_limits(env), 0))
+            self.counters.set_back(simulator)
+            state = self._digest(simulator)
+        for layout, ended in product(range(len(self.starts)), (False, True)):
+            if (layout, state, ended) in self._numbers:
+                return self._numbers[layout, state, ended]
+        raise ValueError("`env` must be in a state of the table, got another one: of a start by another seed, perhaps")
+
     def table(self, names: tuple[str, ...] | None, observations: bool) -> EpisodicWorld:
         """The table."""
         starts = torch.zeros(len(self.layouts), dtype=torch.float64)
@@ -218,6 +242,7 @@ class _Search:
             legal_actions=None if legal.all() else legal,
             layouts=torch.tensor(self.layouts),
             features=torch.from_numpy(np.stack(self.observations)) if observations else None,
+            locate=self.locate,
         )
 
     def check_walks(self, layout: int, start: Start, draw: np.random.Generator) -> None:
@@ -237,7 +262,7 @@ class _Search:
                 view = self.driver.view(simulator, observation, info)
                 same = np.array_equal(view.observation, self.observations[state], equal_nan=True)
                 same = same and bool(ended or self.driver.end(view)) == self.ended[state]
-                if not same or (reward != expected and not self.counters.changes_rewards):
+                if not same or (reward != expected and not self.counters.names):
                     raise ValueError(
                         f"env: action {t} of a walk led to something else than in its table: it is stochastic, or its"
                         ' state is not in its attributes; use method="step"'

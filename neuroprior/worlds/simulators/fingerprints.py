@@ -12,6 +12,12 @@ from torch import Tensor
 
 from neuroprior.worlds.simulators.generators import GENERATORS
 
+GYMNASIUM_MODULES = ("gymnasium.spaces", "gymnasium.envs.registration")
+"""Where classes are defined whose objects say how an environment was made, and are no part of its state."""
+
+SEED_NAME = "_np_random_seed"
+"""The attribute in which Gymnasium's environments remember the seed of their last reset."""
+
 MUTABLE = (list, dict, set, np.ndarray, Tensor)
 
 
@@ -55,7 +61,7 @@ class _Writer:
 
     def _attributes(self, thing: Any) -> None:
         values = vars(thing)
-        for name in sorted(values):
+        for name in sorted(values.keys() - {SEED_NAME}):
             self.parts.append(name)
             self.value(values[name])
 
@@ -123,7 +129,7 @@ def _way(kind: type) -> str:
     """How values of a type are written; one that is made of others, "compound"."""
     if issubclass(kind, (NoneType, int, float, str, bytes, complex)):
         return "enum" if issubclass(kind, Enum) else "value"
-    if kind.__module__.startswith("gymnasium.spaces"):  # they hold generators, and do not change otherwise
+    if kind.__module__.startswith(GYMNASIUM_MODULES):
         return "left out"
     ways = {
         "scalar": np.generic,
