@@ -125,7 +125,7 @@ def test_states_are_distinguished_however_they_are_stored(way):
 
 
 def test_a_counter_that_matters_is_kept():
-    with refuses("`clock` changes with each step, and what happens depends on it", 'method="step"'):
+    with refuses("`clock` changes with each step, and matters", 'method="step"'):
         from_gymnasium(environments.Light())
     world = from_gymnasium(environments.Fuse(), observations=True)
     state = world.reset(1)

@@ -57,8 +57,8 @@ class Counters:
         endless = self._find_endless()
         if endless is not None:
             raise ValueError(
-                f"env: `{name_path(endless)}` changes with each step, and what happens depends on it or it cannot be set"
-                ' back, so that there is no end of states; use method="step"'
+                f"env: `{name_path(endless)}` changes with each step, and matters or cannot be set back,"
+                ' so that there is no end of states; use method="step"'
             )
 
     def set_back(self, simulator: Any) -> None:
@@ -87,8 +87,7 @@ class Counters:
             paths = [
                 path
                 for path, column in columns.items()
-                if _is_monotone(column)
-                and all(a == b for a, b in zip(column, longest.get(path, column), strict=False))
+                if _is_monotone(column) and all(a == b for a, b in zip(column, longest.get(path, column), strict=False))
             ]
             longest = {path: max(columns[path], longest.get(path, ()), key=len) for path in paths}
         return [path for path in paths if len(longest[path]) > 2]

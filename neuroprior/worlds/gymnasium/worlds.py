@@ -16,7 +16,9 @@ from neuroprior.worlds.gymnasium.environment import (
 )
 from neuroprior.worlds.gymnasium.tables import enumerate_states, has_table, read_table
 from neuroprior.worlds.observations import Features
-from neuroprior.worlds.simulators.world import SimulatorWorld, build_world
+from neuroprior.worlds.simulators.building import from_simulator
+from neuroprior.worlds.simulators.driver import FromStep
+from neuroprior.worlds.simulators.world import SimulatorWorld
 from neuroprior.worlds.world import World
 
 METHODS = ("auto", "table", "enumerate", "step")
@@ -110,19 +112,16 @@ def from_gymnasium(
         table = read_table(opened)
         return table.start_anywhere() if starts == "any" else table
     flatten = Flattener(opened.observation_space)
-
-    def build(simulator: Any, start_seeds: list[int] | None) -> SimulatorWorld:
-        observation = Features(flatten.size)
-        how: dict[str, Any] = {"observe": "observation", "observation": observation, "transform": flatten}
-        world = build_world(simulator, None, seeds=start_seeds, seed=seed, prepare=without_limits, **how)
-        world.action_names = action_names(opened)
-        return world
-
+    how: dict[str, Any] = {
+        "observe": FromStep(flatten),
+        "observation": Features(flatten.size),
+        "action_names": action_names(opened),
+    }
     if method != "step" and not (method == "auto" and has_real_numbers(opened.observation_space)):
-        stepped = build(make, [int(one) for one in chosen])
+        stepped = from_simulator(make, seed=seed, seeds=[int(one) for one in chosen], **how)
         if method == "enumerate" or not stepped.stochastic:
             table = enumerate_states(stepped, max_states, observations, progress, seed)
-            if seeds is None and not _starts_alike(stepped, build(make, [seed + 1])):
+            if seeds is None and not _starts_alike(stepped, from_simulator(make, seed=seed, seeds=[seed + 1], **how)):
                 warnings.warn(
                     f"env: it starts otherwise with another seed, but this world has seed {seed} alone: every episode"
                     " begins in the same state; for several starts give, for example, seeds=range(100), for one"
@@ -133,7 +132,9 @@ def from_gymnasium(
     if starts == "any":
         raise ValueError('starts: "any" needs a table of all states, which method="step" does not have')
     running = seeds is None and hasattr(env, "step") and not isinstance(env, type)
-    return build(opened if running else make, None if seeds is None else chosen)
+    world = from_simulator(opened if running else make, seed=seed, seeds=None if seeds is None else chosen, **how)
+    world.prepare = without_limits
+    return world
 
 
 def _starts_alike(world: SimulatorWorld, other: SimulatorWorld) -> bool:

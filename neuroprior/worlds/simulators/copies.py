@@ -150,7 +150,9 @@ def _dumps(simulator: Any, places: dict[int, Path], kinds: set[type]) -> bytes:
     """A pickle in which what stands at these addresses is named by its path; it is of these kinds."""
 
     def reduce(value: Any) -> Any:
-        return (_shared_at, (places[id(value)],)) if id(value) in places else value.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
+        return (
+            (_shared_at, (places[id(value)],)) if id(value) in places else value.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
+        )
 
     file = io.BytesIO()
     pickler = pickle.Pickler(file, pickle.HIGHEST_PROTOCOL)

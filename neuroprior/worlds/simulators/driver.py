@@ -48,6 +48,16 @@ class Path(NamedTuple):
         return self.rewards[self.counts.index(len(self.taken)) if self.counts else -1]
 
 
+class FromStep(NamedTuple):
+    """Observations that are a function of what `step` returned last."""
+
+    transform: Callable[[Any], Any]
+
+
+def _same(observation: Any) -> Any:
+    return observation
+
+
 class Driver:
     """Steps simulators of one kind, and reads what can be seen and done in them.
 
@@ -56,9 +66,9 @@ class Driver:
         first_action: the number of the first action in the simulator.
         legal_actions: a function from a simulator to its legal actions, bool `[A]`; None: a method of the simulator or
             the `action_mask` in its info says so, or all are legal.
-        observe: a function from a simulator to its observation; "observation": what `step` returned; None: nothing.
+        observe: a function from a simulator to its observation; "observation": what `step` returned last; a `FromStep`:
+            a function of that; None: nothing is observed.
         observation: what `observe` returns.
-        transform: a function from what `step` returned to an observation.
 
     Attributes:
         reads_mask: whether a function or a method says which actions are legal.
@@ -72,10 +82,10 @@ class Driver:
         legal_actions: Callable[[Any], Any] | None,
         observe: Any,
         observation: Categories | Features | None,
-        transform: Callable[[Any], Any],
     ) -> None:
         self.num_actions, self.first_action = num_actions, first_action
-        self.observe, self.observation, self.transform = observe, observation, transform
+        self.observe = FromStep(_same) if observe == "observation" else observe
+        self.observation = observation
         self.legal_actions, self.reads_mask = legal_actions, legal_actions is not None
         self.has_masks = self.reads_mask
 
@@ -114,6 +124,7 @@ class Driver:
         """
         mask = None
         if self.reads_mask:
+            assert self.legal_actions is not None
             mask = self.legal_actions(simulator)
         elif isinstance(info, dict):
             mask = info.get("action_mask")
@@ -123,7 +134,7 @@ class Driver:
                 raise ValueError(f"`legal_actions` must be bool [{self.num_actions}], got {list(mask.shape)}")
         if self.observe is None:
             return View(None, mask)
-        if self.observe == "observation":
+        if isinstance(self.observe, FromStep):
             return View(None if observation is None else self.as_declared(observation), mask)
         return View(self._checked(self.observe(simulator)), mask)
 
@@ -133,7 +144,7 @@ class Driver:
 
     def as_declared(self, observation: Any) -> Any:
         """What `step` returned as an observation of this world."""
-        return self._checked(self.transform(observation))
+        return self._checked(self.observe.transform(observation))
 
     def _checked(self, value: Any) -> Any:
         """An observation as declared: an integer, or float32 `[C]`."""
@@ -142,6 +153,7 @@ class Driver:
             if np.ndim(value) or not 0 <= int(value) < number or int(value) != value:
                 raise ValueError(f"`observe` must return an integer from 0 to {number - 1}, got {value!r}")
             return int(value)
+        assert self.observation is not None
         features, size = np.asarray(value, dtype=np.float32), self.observation.size
         if features.shape != (size,):
             raise ValueError(f"`observe` must return {size} numbers, got the shape {list(features.shape)}")

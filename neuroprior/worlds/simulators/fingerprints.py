@@ -117,9 +117,7 @@ class _Writer:
         try:
             reduced = value.__reduce_ex__(4)
         except Exception as error:
-            raise ValueError(
-                f"a {type(value).__name__} cannot be read, so that states cannot be compared"
-            ) from error
+            raise ValueError(f"a {type(value).__name__} cannot be read, so that states cannot be compared") from error
         for part in reduced:
             self.value(list(part) if isinstance(part, Iterator) else part)
 
@@ -131,7 +129,7 @@ def _way(kind: type) -> str:
         return "enum" if issubclass(kind, Enum) else "value"
     if kind.__module__.startswith(GYMNASIUM_MODULES):
         return "left out"
-    ways = {
+    ways: dict[str, Any] = {
         "scalar": np.generic,
         "named": (FunctionType, BuiltinFunctionType, MethodType, ModuleType, type),
         "left out": GENERATORS,

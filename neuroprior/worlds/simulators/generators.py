@@ -68,7 +68,7 @@ def _seed(generator: Any, seed: int) -> None:
     elif isinstance(generator, random.Random):
         generator.seed(seed)
     elif type(generator.bit_generator) is np.random.PCG64:  # five times as fast as by its constructor
-        state = {"state": seed, "inc": (seed >> 64) | 1}
+        state: Any = {"state": seed, "inc": (seed >> 64) | 1}
         generator.bit_generator.state = {"bit_generator": "PCG64", "state": state, "has_uint32": 0, "uinteger": 0}
     else:
         generator.bit_generator.state = type(generator.bit_generator)(seed).state

@@ -1,11 +1,12 @@
 """Finds what a simulator's observations can be read from, where no step has told the last one."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from neuroprior.worlds.simulators.attributes import read, walk
+from neuroprior.worlds.simulators.attributes import Path, read, walk
 from neuroprior.worlds.simulators.copies import Copier
 from neuroprior.worlds.simulators.driver import Driver
 from neuroprior.worlds.simulators.trials import NUM_WALKS, WALK_LENGTH, Start, load_seeded
@@ -39,10 +40,16 @@ def find_reader(driver: Driver, copier: Copier, start: Start) -> Reader | None:
 
 def _candidates(simulator: Any) -> list[Reader]:
     """Methods and attributes that may hold the observation."""
-    methods: list[Reader] = [
-        (lambda held, name=name: getattr(getattr(held, "unwrapped", held), name)()) for name in METHODS
-    ]
-    return methods + [(lambda held, path=path: read(held, path)) for path, _ in walk(simulator) if path]
+    methods: list[Reader] = [partial(_call, name) for name in METHODS]
+    return methods + [partial(_read, path) for path, _ in walk(simulator) if path]
+
+
+def _call(name: str, simulator: Any) -> Any:
+    return getattr(getattr(simulator, "unwrapped", simulator), name)()
+
+
+def _read(path: Path, simulator: Any) -> Any:
+    return read(simulator, path)
 
 
 def _agrees(reader: Reader, simulator: Any, driver: Driver, observation: Any) -> bool:

@@ -42,8 +42,8 @@ class Segment(NamedTuple):
 class Store:
     """Numbers states, and knows how each was reached: by which actions from which other state, under which noise.
 
-    The same actions from the same state under the same noise always have the same number. In a deterministic world
-    all actions count from the first state of an episode, so that states are the same by whatever steps they are reached.
+    The same actions from the same state under the same noise always have the same number. In a deterministic world all
+    actions count from the first state of an episode, so that a state is the same by whatever steps it is reached.
 
     Args:
         num_actions: A.

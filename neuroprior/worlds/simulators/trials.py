@@ -65,7 +65,7 @@ def try_out(driver: Driver, copier: Copier, starts: Sequence[Start], seed: int, 
         simulator = load_seeded(copier, start.saved, first_seed)
         states = state_of_generators(copier.generators(simulator))
         moments, view = random_walk(driver, simulator, start.view, walk * WALK_LENGTH // (2 * NUM_WALKS), draw)
-        saved = copier.save(simulator, (start.saved, [moment.action for moment in moments], first_seed))
+        saved = copier.save(simulator, (start.saved, _actions(moments), first_seed))
         draws = draws or states != state_of_generators(copier.generators(simulator))
         if moments and moments[-1].ended:
             continue
@@ -75,25 +75,23 @@ def try_out(driver: Driver, copier: Copier, starts: Sequence[Start], seed: int, 
         draws = draws or states != state_of_generators(copier.generators(simulator))
         if fingerprint(copier.load(start.saved)) != before:
             raise ValueError("`simulator` must have copies that share nothing with it: stepping one changed another")
-        actions = [moment.action for moment in moments], [moment.action for moment in after]
-        again = _follow(driver, copier, saved, view, actions[1], second_seed)
+        again = _follow(driver, copier, saved, view, _actions(after), second_seed)
         _require_equal(after, again, SEEDED)
         simulator = load_seeded(copier, start.saved, first_seed)
-        whole, _ = follow_on(driver, simulator, start.view, actions[0])
+        whole, _ = follow_on(driver, simulator, start.view, _actions(moments))
         _require_equal(moments, whole, SEEDED)
         seed_generators(copier.generators(simulator), second_seed)
-        rest, _ = follow_on(driver, simulator, view, actions[1])
+        rest, _ = follow_on(driver, simulator, view, _actions(after))
         _require_equal(after, rest, "have copies that behave as it does")
         if look_for_noise and not stochastic:
-            stochastic = _follow(driver, copier, saved, view, actions[1], other_seed) != after
+            stochastic = _follow(driver, copier, saved, view, _actions(after), other_seed) != after
     steps = 0
     while look_for_noise and draws and not stochastic and steps < EXTRA_STEPS:
         start = starts[steps % len(starts)]
         first_seed, other_seed = (int(value) for value in draw.integers(2**62, size=2))
         simulator = load_seeded(copier, start.saved, first_seed)
         moments, _ = random_walk(driver, simulator, start.view, 4 * WALK_LENGTH, draw)
-        actions = [moment.action for moment in moments]
-        stochastic = _follow(driver, copier, start.saved, start.view, actions, other_seed) != moments
+        stochastic = _follow(driver, copier, start.saved, start.view, _actions(moments), other_seed) != moments
         steps += len(moments) + 1
     return Noise(stochastic, draws)
 
@@ -102,9 +100,12 @@ def require_same_starts(driver: Driver, copier: Copier, first: Start, second: St
     """Raise ValueError unless two simulators that were made by the same seed behave alike."""
     simulator = load_seeded(copier, first.saved, 0)
     moments, _ = random_walk(driver, simulator, first.view, WALK_LENGTH, np.random.default_rng(0))
-    actions = [moment.action for moment in moments]
-    again = _follow(driver, copier, second.saved, second.view, actions, 0)
+    again = _follow(driver, copier, second.saved, second.view, _actions(moments), 0)
     _require_equal(moments, again, SEEDED)
+
+
+def _actions(moments: Sequence[Moment]) -> list[int]:
+    return [moment.action for moment in moments]
 
 
 def load_seeded(copier: Copier, saved: Any, seed: int) -> Any:
@@ -114,17 +115,13 @@ def load_seeded(copier: Copier, saved: Any, seed: int) -> Any:
     return simulator
 
 
-def _follow(
-    driver: Driver, copier: Copier, saved: Any, view: View, actions: Sequence[int], seed: int
-) -> list[Moment]:
+def _follow(driver: Driver, copier: Copier, saved: Any, view: View, actions: Sequence[int], seed: int) -> list[Moment]:
     """What a copy gives for these actions under the noise of a seed."""
     simulator = load_seeded(copier, saved, seed)
     return follow_on(driver, simulator, view, actions)[0]
 
 
-def follow_on(
-    driver: Driver, simulator: Any, view: View, actions: Sequence[int]
-) -> tuple[list[Moment], View]:
+def follow_on(driver: Driver, simulator: Any, view: View, actions: Sequence[int]) -> tuple[list[Moment], View]:
     """What a simulator gives for these actions, without those that are not legal, and the last view."""
     moments: list[Moment] = []
     for action in actions:
@@ -164,7 +161,9 @@ def _moment(driver: Driver, simulator: Any, action: int) -> tuple[Moment, View]:
     driver.find_masks(simulator, info)
     view = driver.view(simulator, observation, info)
     seen = fingerprint([observation, view.observation])
-    return Moment(action, seen, reward, ended or driver.end(view), b"" if view.mask is None else view.mask.tobytes()), view
+    return Moment(
+        action, seen, reward, ended or driver.end(view), b"" if view.mask is None else view.mask.tobytes()
+    ), view
 
 
 def _require_equal(first: list[Moment], second: list[Moment], rule: str) -> None:
@@ -172,8 +171,8 @@ def _require_equal(first: list[Moment], second: list[Moment], rule: str) -> None
     for t, (one, other) in enumerate(zip(first, second, strict=False), start=1):
         for name in ("observation", "reward", "ended", "mask"):
             if getattr(one, name) != getattr(other, name) and not one.reward != one.reward:
-                raise ValueError(
-                    f"`simulator` must {rule}; under the same seeds the {name} of action {t} differed"
-                )
+                raise ValueError(f"`simulator` must {rule}; under the same seeds the {name} of action {t} differed")
     if len(first) != len(second):
-        raise ValueError(f"`simulator` must {rule}; under the same seeds walks had {len(first)} and {len(second)} steps")
+        raise ValueError(
+            f"`simulator` must {rule}; under the same seeds walks had {len(first)} and {len(second)} steps"
+        )
