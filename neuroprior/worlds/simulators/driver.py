@@ -154,7 +154,7 @@ class Driver:
                 raise ValueError(f"`observe` must return an integer from 0 to {number - 1}, got {value!r}")
             return int(value)
         assert self.observation is not None
-        features, size = np.asarray(value, dtype=np.float32), self.observation.size
+        features, size = np.atleast_1d(np.asarray(value, dtype=np.float32)), self.observation.size
         if features.shape != (size,):
             raise ValueError(f"`observe` must return {size} numbers, got the shape {list(features.shape)}")
         return features
