@@ -35,7 +35,7 @@ if TYPE_CHECKING:
         save,
     )
     from neuroprior.sampling import sample
-    from neuroprior.worlds import TabularWorld, World, from_gymnasium, gridworld
+    from neuroprior.worlds import TabularWorld, World, from_gymnasium, from_simulator, gridworld
 
 __all__ = [
     "CombinedPrior",
@@ -56,6 +56,7 @@ __all__ = [
     "collect",
     "fit",
     "from_gymnasium",
+    "from_simulator",
     "gridworld",
     "load",
     "oracle",

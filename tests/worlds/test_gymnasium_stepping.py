@@ -172,7 +172,7 @@ GROWING = {
     "list": (list, appended, lambda history: len(history) % 3 == 0),
     "set": (set, lambda s: s | {len(s)}, lambda s: len(s) % 3 == 0),
     "text": (str, lambda s: s + "a", lambda s: len(s) % 3 == 0),
-    "array": (lambda: np.zeros(3), lambda a: a + [0, 1, 0], lambda a: a[1] % 3 == 0),
+    "array": (lambda: np.zeros(3), lambda a: a + np.eye(3)[1], lambda a: a[1] % 3 == 0),
     "tensor": (lambda: torch.zeros(2), lambda a: a + 1, lambda a: a[0] % 3 == 0),
 }
 
