@@ -143,6 +143,35 @@ def test_rare_noise_is_noticed_by_what_is_drawn():
     assert from_simulator(Vain(), 2, stochastic=True).stochastic
 
 
+@pytest.mark.parametrize("draw", [random, np.random.default_rng(3)], ids=["module", "generator"])
+def test_noise_that_no_walk_met_is_noticed_when_it_is_met(draw):
+    class Far(simulators.Walk):
+        """Slips from 50 on."""
+
+        def __init__(self):
+            super().__init__()
+            self.draw = draw
+
+        def step(self, action):
+            self.place += -1 if self.place >= 50 and self.draw.random() < 0.3 else 2 * action - 1
+            return None, float(self.place), self.place == 52
+
+    world, plans = from_simulator(Far(), 2), torch.ones(1, 4000, 52, dtype=torch.long)
+    assert not world.stochastic
+    final = world.rollout(world.reset(1), plans[:, :1]).final_state[:, 0]
+    assert world.stochastic
+    world = from_simulator(Far(), 2)
+    near = world.rollout(world.reset(1), plans[:, :1, :50]).final_state[:, 0]
+    assert not world.stochastic
+    reached, again = (world.rollout(near, plans[:, :, :2], seeded(0)) for _ in range(2))
+    assert world.stochastic
+    assert reached.rewards.equal(again.rewards)
+    assert reached.final_state.equal(again.final_state)
+    share = float((reached.rewards[..., -1] == 52).double().mean())
+    assert abs(share - 0.49) < SIGMAS * (0.49 * 0.51 / 4000) ** 0.5
+    assert len(final) == 1
+
+
 def test_the_simulator_and_the_callers_generators_stay_as_they_were():
     env = gymnasium.make("FrozenLake-v1")
     env.reset(seed=3)

@@ -110,7 +110,7 @@ class Counters:
                 counted.pop()
                 uncounted = uncounted[: len(counted)]
             if not strict:
-                counted, uncounted = ([m._replace(reward=0.0) for m in ms] for ms in (counted, uncounted))
+                counted, uncounted = ([m._replace(reward="") for m in ms] for ms in (counted, uncounted))
             if counted != uncounted:
                 return False
         return True

@@ -116,7 +116,7 @@ def from_simulator(
                 continue
             if [fingerprint(one) for one in originals] != marks:
                 raise ValueError("`simulator` must have copies that share nothing with it: stepping one changed it")
-            noise = noise if stochastic is None else Noise(stochastic, noise.draws or stochastic)
+            noise = noise if stochastic is None else Noise(stochastic, True)
             kept = starts if make is None or seeds is not None else []
             world = SimulatorWorld(driver, copier, noise, make, kept, workers)
             world.objective, world.discount = objective, discount

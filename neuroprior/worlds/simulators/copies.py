@@ -51,6 +51,10 @@ class Copier(ABC):
     def generators(self, simulator: Any) -> list[Any]:
         """The generators of a simulator that `load` returned."""
 
+    def shared_generators(self) -> list[Any]:
+        """The generators that all copies share."""
+        return []
+
     def text(self, saved: Any) -> bytes:
         """Bytes that are the same only where all that was saved is the same; empty where there are none."""
         return b""
@@ -74,6 +78,9 @@ class _SharingCopier(Copier):
         self._shared: dict[Path, Any] = {}
 
     def generators(self, simulator: Any) -> list[Any]:
+        return self.shared_generators()
+
+    def shared_generators(self) -> list[Any]:
         return [value for value in self._shared.values() if isinstance(value, GENERATORS)]
 
     def _share(self, simulator: Any) -> dict[int, Path]:

@@ -35,17 +35,27 @@ def seed_generators(generators: Iterable[Any], seed: int) -> None:
     torch.default_generator.manual_seed(_mix(seed, 2) % 2**63)
 
 
-def state_of_generators(generators: Iterable[Any]) -> list[str]:
-    """The states of generators, and of those of the modules, as texts to compare."""
-    texts = [str(random.getstate()), str(np.random.get_state()), str(torch.get_rng_state().tolist())]  # noqa: NPY002
+def state_of_generators(generators: Iterable[Any]) -> list[Any]:
+    """The states of generators, and of those of the modules, to be compared."""
+    numpy_state = np.random.get_state(legacy=False)  # noqa: NPY002
+    states: list[Any] = [random.getstate(), _comparable(numpy_state), torch.get_rng_state().numpy().tobytes()]
     for generator in generators:
         if isinstance(generator, np.random.Generator):
-            texts.append(str(generator.bit_generator.state))
+            states.append(_comparable(generator.bit_generator.state))
         elif isinstance(generator, torch.Generator):
-            texts.append(str(generator.get_state().tolist()))
+            states.append(generator.get_state().numpy().tobytes())
+        elif isinstance(generator, random.Random):
+            states.append(generator.getstate())
         else:
-            texts.append(str(generator.getstate() if isinstance(generator, random.Random) else generator.get_state()))
-    return texts
+            states.append(_comparable(generator.get_state(legacy=False)))
+    return states
+
+
+def _comparable(state: Any) -> Any:
+    """The state of a bit generator of numpy with bytes in place of arrays."""
+    if isinstance(state, dict):
+        return {key: _comparable(value) for key, value in state.items()}
+    return state.tobytes() if isinstance(state, np.ndarray) else state
 
 
 @contextmanager

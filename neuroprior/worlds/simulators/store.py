@@ -47,12 +47,12 @@ class Store:
 
     Args:
         num_actions: A.
-        deterministic: whether there is no noise.
+        deterministic: whether there is no noise; may become False.
     """
 
     def __init__(self, num_actions: int, deterministic: bool) -> None:
         self._kind = np.dtype(np.uint8 if num_actions <= 2**8 else np.int32)
-        self._deterministic = deterministic
+        self.deterministic = deterministic
         self._numbers: dict[Segment, int] = {}
         self._segments: list[Segment] = []
         self._rewards, self._ended = array("d"), array("b")
@@ -89,7 +89,7 @@ class Store:
         """An earlier state, in a deterministic world the last that is `kept`, the actions since, and their seed."""
         start, actions, seed = self._segments[handle]
         width = self._kind.itemsize
-        if self._deterministic:
+        if self.deterministic:
             for end in range(len(actions) - width, 0, -width):
                 earlier = self._numbers.get(Segment(start, actions[:end], seed), -1)
                 if earlier in kept:
@@ -98,7 +98,7 @@ class Store:
 
     def _segment(self, start: int, actions: list[int], seed: int) -> Segment:
         written = bytes(actions) if self._kind.itemsize == 1 else np.array(actions, self._kind).tobytes()
-        if self._deterministic:
+        if self.deterministic:
             first = self._segments[start]
             if first.start >= 0:
                 return Segment(first.start, first.actions + written, first.seed)

@@ -1,7 +1,7 @@
 """Simulators as worlds: a planner tries plans in copies of them."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
 import torch
@@ -12,11 +12,17 @@ from neuroprior._random import generator_on
 from neuroprior.worlds.observations import Categories
 from neuroprior.worlds.simulators.copies import Copier, ReplayCopier
 from neuroprior.worlds.simulators.driver import Driver, Path, View, follow_plans
-from neuroprior.worlds.simulators.generators import keep_global_generators, seed_generators
+from neuroprior.worlds.simulators.generators import (
+    keep_global_generators,
+    seed_generators,
+    state_of_generators,
+)
 from neuroprior.worlds.simulators.readers import Reader, find_reader
 from neuroprior.worlds.simulators.store import Recent, Store
 from neuroprior.worlds.simulators.trials import Noise, Start
 from neuroprior.worlds.world import Rollout, World, check_plans, on_cpu
+
+Result = TypeVar("Result")
 
 MAX_SNAPSHOTS, MAX_VIEWS = 2048, 2**15
 """Copies of simulators that are kept, and views (observations and legal actions) of states."""
@@ -116,12 +122,15 @@ class SimulatorWorld(World):
 
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         """See `World.step`. An action that is not legal changes nothing, with a reward of 0."""
+        generator = generator_on(generator, "cpu")
+        return self._run(lambda: self._step(state, action, generator))
+
+    def _step(self, state: Tensor, action: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         seeds = self._draw_seeds((len(state),), generator).tolist()
         after, rewards = state.tolist(), [0.0] * len(state)
-        with keep_global_generators():
-            for row, (start, one, seed) in enumerate(zip(state.tolist(), action.tolist(), seeds, strict=True)):
-                if not self._is_over(start):
-                    after[row], rewards[row] = self._take(start, one, seed)
+        for row, (start, one, seed) in enumerate(zip(state.tolist(), action.tolist(), seeds, strict=True)):
+            if not self._is_over(start):
+                after[row], rewards[row] = self._take(start, one, seed)
         return torch.tensor(after, dtype=torch.long), torch.tensor(rewards, dtype=torch.float64)
 
     def rollout(
@@ -133,28 +142,30 @@ class SimulatorWorld(World):
         """
         self.check_state(state)
         check_plans(plans, len(state), self.num_actions)
+        generator = generator_on(generator, "cpu")
+        return self._run(lambda: self._rollout(state, plans, generator, keep_states))
+
+    def _rollout(self, state: Tensor, plans: Tensor, generator: torch.Generator, keep_states: bool) -> Rollout:
         batch, num_plans, length = plans.shape
         seeds = self._draw_seeds((batch, num_plans), generator)
         rewards = np.zeros((batch, num_plans, length))
         final = state[:, None].repeat(1, num_plans).numpy()
         states = state[:, None, None].repeat(1, num_plans, length).numpy() if keep_states else None
-        with keep_global_generators():
-            for row, start in enumerate(state.tolist()):  # a simulator runs one plan at a time
-                if self._is_over(start) or not length:
-                    continue
-                tried: dict[tuple[int, ...], tuple[Path, int]] = {}
-                keys = [(*plan, seed) for plan, seed in zip(plans[row].tolist(), seeds[row].tolist(), strict=True)]
-                distinct = list(dict.fromkeys(keys))
-                paths = self._follow(start, distinct, keep_states)
-                for key, path in zip(distinct, paths, strict=True):
-                    tried[key] = path, self._store.add(start, path.taken, key[-1], path.last_reward(), path.ended)
-                    if path.views:
-                        self._views.put(tried[key][1], path.views[-1])
-                for column, key in enumerate(keys):
-                    path, final[row, column] = tried[key]
-                    rewards[row, column, : len(path.rewards)] = path.rewards
-                    if states is not None:
-                        states[row, column] = self._number_path(start, path, key[-1], length)
+        for row, start in enumerate(state.tolist()):  # a simulator runs one plan at a time
+            if self._is_over(start) or not length:
+                continue
+            keys = [(*plan, seed) for plan, seed in zip(plans[row].tolist(), seeds[row].tolist(), strict=True)]
+            distinct = list(dict.fromkeys(keys))
+            tried: dict[tuple[int, ...], tuple[Path, int]] = {}
+            for key, path in zip(distinct, self._follow(start, distinct, keep_states), strict=True):
+                tried[key] = path, self._store.add(start, path.taken, key[-1], path.last_reward(), path.ended)
+                if path.views:
+                    self._views.put(tried[key][1], path.views[-1])
+            for column, key in enumerate(keys):
+                path, final[row, column] = tried[key]
+                rewards[row, column, : len(path.rewards)] = path.rewards
+                if states is not None:
+                    states[row, column] = self._number_path(start, path, key[-1], length)
         kept = None if states is None else torch.from_numpy(states)
         return Rollout(torch.from_numpy(final), torch.from_numpy(rewards), kept)
 
@@ -194,11 +205,24 @@ class SimulatorWorld(World):
             raise ValueError("`state` must be int64 of shape [B], such as reset and state_of return")
         check_range("state", state, len(self._store), "states so far")
 
-    def _draw_seeds(self, shape: tuple[int, ...], generator: torch.Generator | None) -> Tensor:
+    def _run(self, work: Callable[[], Result]) -> Result:
+        """What `work` returns; where it draws random numbers, as no walk did, the world becomes stochastic."""
+        with keep_global_generators():
+            if self._draws:
+                return work()
+            held = self.copier.shared_generators()
+            before = state_of_generators(held)
+            result = work()
+            if state_of_generators(held) == before:
+                return result
+            self.stochastic, self._draws, self._store.deterministic = True, True, False
+            return work()
+
+    def _draw_seeds(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
         """A seed for each plan; all 0 in a deterministic world."""
         if not self.stochastic:
             return torch.zeros(shape, dtype=torch.long)
-        return torch.randint(2**62, shape, generator=generator_on(generator, "cpu"))
+        return torch.randint(2**62, shape, generator=generator)
 
     def _pin(self, start: Start) -> int:
         """The number of a state that cannot be reached again, so that its copy is kept."""
