@@ -158,7 +158,7 @@ def test_noise_that_no_walk_met_is_noticed_when_it_is_met(draw):
 
     world, plans = from_simulator(Far(), 2), torch.ones(1, 4000, 52, dtype=torch.long)
     assert not world.stochastic
-    final = world.rollout(world.reset(1), plans[:, :1]).final_state[:, 0]
+    world.rollout(world.reset(1), plans[:, :1])
     assert world.stochastic
     world = from_simulator(Far(), 2)
     near = world.rollout(world.reset(1), plans[:, :1, :50]).final_state[:, 0]
@@ -169,7 +169,6 @@ def test_noise_that_no_walk_met_is_noticed_when_it_is_met(draw):
     assert reached.final_state.equal(again.final_state)
     share = float((reached.rewards[..., -1] == 52).double().mean())
     assert abs(share - 0.49) < SIGMAS * (0.49 * 0.51 / 4000) ** 0.5
-    assert len(final) == 1
 
 
 def test_the_simulator_and_the_callers_generators_stay_as_they_were():
