@@ -258,6 +258,24 @@ def test_a_running_simulator_is_planned_in_step_by_step():
     assert several.reset(100, seeded(0)).unique().tolist() == [0, 1]
 
 
+def test_states_are_forgotten_on_demand():
+    world, real = from_simulator(simulators.Walk(), 2), simulators.Walk()
+    real.step(1)
+    old, up = world.state_of(real), torch.ones(1, 1, 4, dtype=torch.long)
+    final = world.rollout(old, up).final_state[:, 0]
+    world.forget()
+    assert world.rollout(world.reset(1), up).rewards.sum() == 1
+    assert world.rollout(world.state_of(real), up).rewards[0, 0].tolist() == [0, 1, 0, 0]
+    for state in (old, final):
+        with refuses("from before `forget` was called"):
+            world._snapshot(int(state))
+    made = from_simulator(simulators.NoisyStart)
+    state = made.reset(4, seeded(0))
+    first = made.rollout(state, up.expand(4, -1, -1)).rewards
+    made.forget()
+    assert made.rollout(state, up.expand(4, -1, -1)).rewards.equal(first)
+
+
 MASKED = {
     "method": (simulators.DoorsWithMethod(), {}),
     "argument": (simulators.Doors(), {"legal_actions": simulators.Doors.legal}),

@@ -120,6 +120,16 @@ class SimulatorWorld(World):
             ]
         return torch.tensor(found, dtype=torch.long)
 
+    def forget(self) -> None:
+        """Free the memory of all simulators but those that `reset` returns, after a long run.
+
+        States that `state_of` returned before, and those reached from them, raise a ValueError from now on.
+        """
+        for handle in self._pinned.keys() - set(self._start_states):
+            del self._pinned[handle], self._pinned_views[handle]
+        self._snapshots.clear()
+        self._views.clear()
+
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         """See `World.step`. An action that is not legal changes nothing, with a reward of 0."""
         generator = generator_on(generator, "cpu")
@@ -226,7 +236,7 @@ class SimulatorWorld(World):
 
     def _pin(self, start: Start) -> int:
         """The number of a state that cannot be reached again, so that its copy is kept."""
-        handle = self._store.add_start(-1 - len(self._pinned))
+        handle = self._store.add_start(-1 - len(self._store))
         self._pinned[handle], self._pinned_views[handle] = start
         return handle
 
@@ -337,7 +347,8 @@ class SimulatorWorld(World):
         for at in reversed(chain):
             seed = self._store.start_seed(at)
             if seed is not None:
-                assert self._make is not None  # the copies of other starts are always kept
+                if seed < 0 or self._make is None:
+                    raise ValueError("`state` must be one that is kept, got one from before `forget` was called")
                 start = make_start(self.driver, self.copier, self._make, seed)
                 self._snapshots.put(at, start.saved)
                 self._views.put(at, start.view)
