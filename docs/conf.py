@@ -76,6 +76,7 @@ ROOMS = {
     "neuroprior.sampling": "Sampling",
     "neuroprior.worlds": "Worlds",
     "neuroprior.planners": "Planners",
+    "neuroprior.comparison": "Comparisons",
     "neuroprior.agents": "Agents",
     "neuroprior": "The top level",
     "neuroprior.behaviour": "Recorded behaviour",

@@ -1,10 +1,10 @@
 """neuroprior: behavioural priors, learned from executed plans, that sample better candidate plans for a planner.
 
 Here are the names that most programs need. The others of the core are in its rooms: `neuroprior.plans`,
-`neuroprior.priors`, `neuroprior.sampling`, `neuroprior.worlds`, `neuroprior.planners`, `neuroprior.training`,
-`neuroprior.agents` and `neuroprior.testing`. Each wing exports its own: `neuroprior.behaviour` (recorded behaviour),
-`neuroprior.control` (actions that are vectors) and `neuroprior.puzzles` (search with a guarantee). A room is imported
-when one of its names is first used: torch, which all need, takes seconds.
+`neuroprior.priors`, `neuroprior.sampling`, `neuroprior.worlds`, `neuroprior.planners`, `neuroprior.comparison`,
+`neuroprior.training`, `neuroprior.agents` and `neuroprior.testing`. Each wing exports its own: `neuroprior.behaviour`
+(recorded behaviour), `neuroprior.control` (actions that are vectors) and `neuroprior.puzzles` (search with a
+guarantee). A room is imported when one of its names is first used: torch, which all need, takes seconds.
 """
 
 from importlib import import_module
@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Any
 from neuroprior._version import __version__
 
 if TYPE_CHECKING:
+    from neuroprior.comparison import compare
     from neuroprior.planners import (
         ExhaustivePlanner,
+        FrontierPlanner,
         MCTSPlanner,
         Planner,
         SamplingPlanner,
@@ -41,6 +43,7 @@ __all__ = [
     "CombinedPrior",
     "ContextTreePrior",
     "ExhaustivePlanner",
+    "FrontierPlanner",
     "GRUPrior",
     "MCTSPlanner",
     "MarkovPrior",
@@ -54,6 +57,7 @@ __all__ = [
     "World",
     "__version__",
     "collect",
+    "compare",
     "fit",
     "from_gymnasium",
     "from_simulator",
@@ -66,7 +70,7 @@ __all__ = [
     "write_plans",
 ]
 
-_ROOMS = ("plans", "worlds", "sampling", "priors", "planners")
+_ROOMS = ("plans", "worlds", "sampling", "priors", "planners", "comparison")
 """Where the names above are: those that import the fewest others first."""
 
 _OTHER_ROOMS = ("agents", "behaviour", "control", "puzzles", "testing", "training")

@@ -113,14 +113,50 @@ class JobRun(Generic[Job, Result]):
         return [self.read(job) for job in jobs]
 
     def _do(self, jobs: Sequence[Job], processes: int, dask: str | None, progress: "Progress") -> None:
-        call = partial(_attempt, self.run, parent=os.getpid() if dask is None else None)
         with progress:
-            for index, result in _unordered(call, jobs, processes, dask):
-                where = self.name(jobs[index])
-                if isinstance(result, Failure):
-                    raise result.error(where)
-                self._save(self.path(jobs[index]), result)
-                progress.advance(where)
+            for job, result in each_result(self.run, jobs, processes, dask, self.name):
+                self._save(self.path(job), result)
+                progress.advance(self.name(job))
+
+
+def each_result(
+    run: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    processes: int,
+    dask: str | None = None,
+    name: Callable[[Job], str] = str,
+) -> Iterator[tuple[Job, Result]]:
+    """The jobs with their results, each as soon as it is there; all are done in one thread.
+
+    Args:
+        run: does a job. It can be pickled, where there are several processes.
+        jobs: the jobs.
+        processes: how many are done at a time; 1: in this process.
+        dask: see `JobRun.do`.
+        name: of a job, for messages.
+
+    Raises:
+        ValueError: a job failed (the message names it), or the cluster cannot be used.
+        MemoryError: memory ran out or a process was killed.
+    """
+    call = partial(_attempt, run, parent=os.getpid() if dask is None else None)
+    for index, result in _unordered(call, jobs, processes, dask):
+        if isinstance(result, Failure):
+            raise result.error(name(jobs[index]))
+        yield jobs[index], result
+
+
+def sending_error(value: object) -> str | None:
+    """Why a value cannot be sent to other processes on this machine, in a few words; None: it can."""
+    try:
+        from joblib.externals.loky.backend.reduction import dumps
+    except ImportError:
+        return "joblib is not installed; pip install 'neuroprior[report]'"
+    try:
+        dumps(value)
+    except Exception as error:  # whatever an object of the user's raises
+        return f"{type(error).__name__}: {error}"
+    return None
 
 
 class Failure:

@@ -1,5 +1,6 @@
 """`python -m eval compare`: do neural priors help a planner more than Markov chains, in many worlds at equal budget?"""
 
+import inspect
 from collections.abc import Mapping, Sequence
 from functools import partial, reduce
 from typing import Any, Literal
@@ -7,6 +8,7 @@ from typing import Any, Literal
 import torch
 from jsonargparse.typing import NonNegativeInt, PositiveInt, restricted_number_type
 
+from eval.compare.any_world import compare_in
 from eval.compare.beside import Result, finished_runs, put_beside
 from eval.compare.planners import PlannerName, PlannerSettings, check_planners, planner_document, planner_run
 from eval.compare.priors import COMBINED, NEURAL, load_for
@@ -41,6 +43,9 @@ def compare(
     processes: PositiveInt | None = None,
     dask: str | None = None,
     out: str = "runs/compare",
+    world: str | None = None,
+    length: PositiveInt | None = None,
+    seconds: PositiveInt = 120,
 ) -> None:
     """Do neural priors help a planner more than Markov chains, in many worlds at equal budget?
 
@@ -75,8 +80,22 @@ def compare(
         processes: how many runs, a world and a seed each, are done at a time; all cores by default.
         dask: address of a Dask scheduler whose workers do the runs, such as tcp://host:8786.
         out: folder for the report, and for finished runs, from which an interrupted command goes on.
+        world: a world of yours instead, made by a function without arguments: my_module:make_world. Priors and planners
+            (all by default) are compared there by `neuroprior.compare`, for as many seeds as there is time for; the
+            table and figure are written to --out. Of the options above, worlds, beside, context, rounds, steps and dask
+            are not for it.
+        length: with --world: actions in a plan.
+        seconds: with --world: the time in which all should be done.
     """
     saved = tuple(priors or ())
+    if world is not None:
+        check_for_any_world(worlds=worlds, beside=beside, context=context, rounds=rounds, steps=steps, dask=dask)
+        asked_for: dict[str, Any] = {"kinds": kinds, "planners": planners, "length": length, "processes": processes}
+        sizes: dict[str, Any] = {"seeds": seeds, "starts": starts, "training_starts": training_starts}
+        compare_in(world, num_plans=num_plans, priors=saved, seconds=seconds, seed=seed, out=out, **asked_for, **sizes)
+        return
+    if length is not None:
+        raise ValueError("`length` is for --world alone; worlds of the comparison have lengths of their own")
     fitted = tuple(([] if saved else KINDS) if kinds is None else kinds)
     if not fitted and not saved:
         raise ValueError("`kinds` must have at least one prior, unless there are --priors")
@@ -109,6 +128,14 @@ def report(
     return document(results, {**settings, **({"beside": list(others)} if others else {})}, line)
 
 
+def check_for_any_world(**options: object) -> None:
+    """Raise ValueError for an option of `compare` that has another value than by default, and is not for --world."""
+    defaults = inspect.signature(compare).parameters
+    for name, value in options.items():
+        if value is not None and (tuple(value) if isinstance(value, list) else value) != defaults[name].default:
+            raise ValueError(f"`{name}` is not for --world; leave it out")
+
+
 def check_saved(folders: Sequence[str], worlds: Sequence[str]) -> None:
     """Raise ValueError unless saved priors have the actions and contexts of all worlds; before hours of work."""
     observations: dict[str, torch.Tensor] = {}  # by world: some take long to make
@@ -121,7 +148,7 @@ def check_saved(folders: Sequence[str], worlds: Sequence[str]) -> None:
             if prior.takes_context:
                 if world not in observations:
                     held_out = task.worlds(0).held_out
-                    observations[world] = held_out.observe(held_out.reset(1, torch.Generator().manual_seed(0)))
+                    observations[world] = held_out.context(held_out.reset(1, torch.Generator().manual_seed(0)))
                 try:
                     prior.check_context_of(observations[world], 1)
                 except ValueError as error:

@@ -82,7 +82,7 @@ class HorizonPlanner(SamplingPlanner):
         self.rounds = min(rounds, num_plans - self.first)
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
-        generator = self._check(world, state, generator)
+        _, generator = self._prepare(world, state, generator)
         chunks = self.chunks(state, self.model_steps(world))
         return join_decisions((self._plan(world, some, generator) for some in chunks), len(state))
 
@@ -107,7 +107,7 @@ class HorizonPlanner(SamplingPlanner):
         )
         plans, score, ends = sampler.candidates(world, state, generator)
         if depth == self.length:
-            self._warn_of_costs(score)
+            self._warn_of_costs(world, score)
         best = decide(plans, score, ends, 0, generator)
         # At each horizon the score of a plan is that of its best prefix so far.
         so_far = score.double().cummax(2).values
@@ -117,9 +117,14 @@ class HorizonPlanner(SamplingPlanner):
         steps = torch.full_like(ties, sampler.model_steps(world))
         return _Found(best._replace(plan=pad(best.plan, (0, longer))), ties, pad(moments, (0, 0, 0, longer)), steps)
 
-    def _warn_of_costs(self, score: Tensor) -> None:
+    def _warn_of_costs(self, world: World, score: Tensor) -> None:
         """Warn where the `score [B, P, L]` of all prefixes only ever falls, so that each plan stops at once."""
-        if self.objective != "return" or self.value is not None or self.length == 1 or not score.numel():
+        if (
+            self.for_world(world).objective != "return"
+            or self.value is not None
+            or self.length == 1
+            or not score.numel()
+        ):
             return
         if bool((score.diff(dim=2) <= 0).all()) and bool((score[..., -1] < score[..., 0]).any()):
             warnings.warn(

@@ -52,9 +52,9 @@ def chain(order: int, world: World, plans: Plans, feature_sets: Sequence[tuple[i
     return MarkovPrior(plans.num_actions, order)
 
 
-def macro(plans: Plans) -> MacroPrior:
+def make_macro(num_actions: int) -> MacroPrior:
     """A chain over actions and macro-actions."""
-    return MacroPrior(plans.num_actions, MarkovPrior(plans.num_actions + MACROS, MACRO_ORDER))
+    return MacroPrior(num_actions, MarkovPrior(num_actions + MACROS, MACRO_ORDER))
 
 
 def network(kind: str, world: World, plans: Plans, seed: int) -> Prior:

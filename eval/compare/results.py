@@ -17,7 +17,7 @@ from scipy import optimize, stats
 from eval.compare.priors import COMBINED, NEURAL
 from eval.worlds.runs import across_worlds, frame_of, seed_means
 from eval.worlds.suite import Context
-from neuroprior.behaviour.analysis.statistics import Difference, holm
+from neuroprior._statistics import Difference, holm
 
 Array = NDArray[np.float64]
 

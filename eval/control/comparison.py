@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from eval.control.priors import CLONING, NETWORK, NONE, SIMPLE
 from eval.worlds import runs
-from neuroprior.behaviour.analysis.statistics import ENOUGH_UNITS
+from neuroprior._statistics import ENOUGH_UNITS
 
 REFERENCE = 100
 """Candidates of the plain planner whose return is to be reached with fewer, or the nearest number that is tried."""

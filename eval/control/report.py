@@ -11,7 +11,7 @@ from eval.control.comparison import against_simple, differences, over_budgets, s
 from eval.control.priors import NONE
 from eval.control.tasks import CONDITIONS, TASKS
 from eval.worlds import runs
-from neuroprior.behaviour.analysis.statistics import ENOUGH_UNITS
+from neuroprior._statistics import ENOUGH_UNITS
 from neuroprior.behaviour.report.document import Column, Document, table
 from neuroprior.behaviour.report.drawing import WIDTH, at_edges, band, drawn, legend, panels
 from neuroprior.behaviour.report.page import FigureBox, Section, Table

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior.behaviour.analysis.statistics import Interval, ratio_difference, share_interval
+from neuroprior._statistics import Interval, ratio_difference, share_interval
 
 
 class Bin(NamedTuple):

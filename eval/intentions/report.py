@@ -11,7 +11,7 @@ from eval.intentions.calibration import calibration_error, filled_bins
 from eval.intentions.grid import FORECAST_AFTER, SWITCH_AT
 from eval.intentions.run import LABYRINTH
 from eval.worlds import runs
-from neuroprior.behaviour.analysis.statistics import mean_interval
+from neuroprior._statistics import mean_interval
 from neuroprior.behaviour.report.document import Column, Document, table
 from neuroprior.behaviour.report.drawing import WIDTH, at_edges, band, drawn, legend, panels
 from neuroprior.behaviour.report.page import FigureBox, Section, Table

@@ -61,7 +61,7 @@ class ForagingWorld(World):
             raise ValueError("`growth` must be finite numbers of at least 0, in each season one above it")
         self.table, self.growth, self.period, self.num_items = table, growth, period, num_items
         self.num_actions, self.action_names = table.num_actions, table.action_names
-        self.all_legal, self.stochastic = table.all_legal, table.stochastic
+        self.all_legal, self.stochastic, self.observation = table.all_legal, table.stochastic, table.observation
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         """States `[batch_size, 2 + K]` at time 0: random cells, with food at random places of the first season."""

@@ -74,7 +74,7 @@ class ForagingOracle(Planner):
         Sets of items are numbers of K bits: the last dimension is the set that is left; `there [B, S]` is the set that
         lies in each cell.
         """
-        table, (batch, cells) = world.table, there.shape
+        table, (batch, cells), discount = world.table, there.shape, float(self.discounts(torch.empty(1))[1])
         items = torch.arange(2**world.num_items, device=there.device)
         start, cell = there.nonzero(as_tuple=True)  # elsewhere nothing is gained
         found = items & there[start, cell][:, None]
@@ -84,7 +84,7 @@ class ForagingOracle(Planner):
             cells * world.num_actions, batch * len(items)
         )  # allocating it anew would cost more than filling it
         for _ in range(self.length):
-            worth = self.discount * value
+            worth = discount * value
             worth[cell, start] = gain + worth[cell, start].gather(1, after)
             arriving.append(worth)
             # One row per cell: whole rows are copied.

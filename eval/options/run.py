@@ -16,7 +16,7 @@ from eval.worlds.starts import Starts, starts_of
 from eval.worlds.suite import TASKS
 from neuroprior import ExhaustivePlanner, Plans, SamplingPlanner, World, collect, read_plans
 from neuroprior.planners.tuning import choices
-from neuroprior.worlds import labyrinth
+from neuroprior.worlds import Categories, labyrinth
 
 LABYRINTH = "labyrinth"
 """The world whose plans are the mice's; the others are those of `eval.worlds.suite`."""
@@ -131,6 +131,7 @@ def observed(world: World, index: ContextIndex) -> World:
         return index(observe(state))
 
     made.observe = number  # type: ignore[method-assign]
+    made.observation = Categories(index.size)
     return made
 
 

@@ -20,7 +20,7 @@ from neuroprior import (
     TransformerPrior,
     UniformPrior,
 )
-from neuroprior.behaviour.analysis.statistics import Interval, mean_interval, paired_difference, share_interval
+from neuroprior._statistics import Interval, mean_interval, paired_difference, share_interval
 from neuroprior.worlds import GridWorld
 
 ANY_PREFIX = " (any prefix)"

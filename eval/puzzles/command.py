@@ -29,7 +29,7 @@ from eval.puzzles.contest import (
 from eval.worlds.runs import check_distinct, command_line
 from neuroprior._files import write_whole
 from neuroprior._jobs import JobRun
-from neuroprior.behaviour.analysis.statistics import paired_difference
+from neuroprior._statistics import paired_difference
 from neuroprior.behaviour.report.document import Document, publish, table
 from neuroprior.behaviour.report.page import Section, Table
 

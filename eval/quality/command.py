@@ -19,8 +19,8 @@ from eval.worlds.runs import Seed, plus_minus
 from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, Prior, TransformerPrior, fit
 from neuroprior._jobs import JobRun, Progress
 from neuroprior._random import draw_seed
+from neuroprior._statistics import paired_difference
 from neuroprior.behaviour.analysis.comparison import Score, score
-from neuroprior.behaviour.analysis.statistics import paired_difference
 from neuroprior.behaviour.report.document import Column, Document, publish, table
 from neuroprior.behaviour.report.page import Section, Table
 from neuroprior.priors.ensembles.candidates import best_chain

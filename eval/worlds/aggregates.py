@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy import special, stats
 
-from neuroprior.behaviour.analysis.statistics import Interval, mean_interval
+from neuroprior._statistics import Interval, mean_interval
 
 Array = NDArray[np.float64]
 

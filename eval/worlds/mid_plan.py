@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor, nn
 
-from neuroprior.planners import Planner
-from neuroprior.worlds import TabularWorld, World
+from neuroprior.planners import ExhaustivePlanner
+from neuroprior.worlds import Features, TabularWorld, World
 
 
 class MidPlanWorld(World):
@@ -19,10 +19,11 @@ class MidPlanWorld(World):
         taken: how many of their actions are executed.
     """
 
-    def __init__(self, world: TabularWorld, planner: Planner, taken: int) -> None:
+    def __init__(self, world: TabularWorld, planner: ExhaustivePlanner, taken: int) -> None:
         self.world, self.planner, self.taken = world, planner, taken
         self.num_actions, self.all_legal, self.stochastic = world.num_actions, world.all_legal, world.stochastic
-        self.action_names, self.has_goal = world.action_names, world.has_goal
+        self.action_names, self.has_goal, self.objective = world.action_names, world.has_goal, world.objective
+        self.observation = Features((planner.depth - taken) * world.num_actions)
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         """States `[batch_size, 1 + R]`, int64: the inner world's after `taken` actions, and the R actions left."""

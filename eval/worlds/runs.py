@@ -19,7 +19,7 @@ from jsonargparse.typing import extend_base_type, restricted_number_type
 from eval.worlds.aggregates import interquartile_gap, interquartile_mean, mean_intervals, probability_of_improvement
 from neuroprior._files import read_json
 from neuroprior._jobs import JobRun
-from neuroprior.behaviour.analysis.statistics import holm, paired_difference
+from neuroprior._statistics import holm, paired_difference
 from neuroprior.behaviour.report.document import Column, Document, publish, table
 from neuroprior.behaviour.report.page import Table
 

@@ -11,7 +11,16 @@ from torch import Tensor
 from eval.worlds import minigrid
 from eval.worlds.mid_plan import MidPlanWorld
 from neuroprior.planners import ExhaustivePlanner
-from neuroprior.worlds import EpisodicWorld, PocketCube, TabularWorld, World, from_gymnasium, goal_direction, maze
+from neuroprior.worlds import (
+    EpisodicWorld,
+    Features,
+    PocketCube,
+    TabularWorld,
+    World,
+    from_gymnasium,
+    goal_direction,
+    maze,
+)
 
 MAPS = 100
 """Reward maps or layouts in each of the three worlds of a seed, where they cost nothing to make."""
@@ -109,6 +118,7 @@ def goal_mazes(seed: int) -> Worlds:
             return torch.cat([around(state), away / world.width, away.sign()], -1)
 
         world.observe = observe  # type: ignore[method-assign]
+        world.observation = Features(observe(torch.zeros(1, dtype=torch.long)).shape[1])
         return world
 
     return from_seeds(seed, make)

@@ -1,7 +1,7 @@
 """Online learning: an agent plans, executes, and fits its prior to what it executed, again and again."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,24 +10,41 @@ from neuroprior._checks import check_flags, check_memory, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.agents.replay import Replay
 from neuroprior.planners import Decision, Execution, Planner
-from neuroprior.planners.execution import Change, check_change, executed_steps, follow, join_executions, observations
+from neuroprior.planners.execution import Change, check_change, follow, join_executions, observations
 from neuroprior.planners.planner import check_is_planner
 from neuroprior.planners.warm_start import with_rest
 from neuroprior.plans import Plans
 from neuroprior.priors import CombinedPrior, Prior
 from neuroprior.priors.prior import check_is_prior
 from neuroprior.sampling.stepping import check_actions
-from neuroprior.worlds.world import World, check_is_world
+from neuroprior.worlds.world import World, check_is_world, is_over
+
+
+class Steps(NamedTuple):
+    """Steps of B agents that are to be stored as plans.
+
+    Attributes:
+        before: `[B, T, ...]`: the state before each action.
+        actions, rewards: `[B, T]`.
+        fresh: `[B]` bool: whose first step begins a new episode.
+    """
+
+    before: Tensor
+    actions: Tensor
+    rewards: Tensor
+    fresh: Tensor
 
 
 class Agent:
     """Plans, executes the first actions, replans, and so on; meanwhile its prior is fitted to what was executed.
 
+    Where an episode is over, the agent begins anew in a state that `world.reset` draws, before it plans again.
+
     B agents, each in a state of its own, share one prior and learn from one another. What they execute is cut into
-    plans of `plan_length` actions, which go into a `Replay`. Every `learn_every` steps some of the stored plans are
-    forgotten, and the prior is fitted to the rest: count-based priors anew, so that their counts decay exponentially;
-    neural ones from their present weights. The prior is fitted in place, so that a planner with the same prior changes
-    along. It is not fitted to fewer than two plans.
+    plans of `plan_length` actions, fewer where an episode ends, which go into a `Replay`. Every `learn_every` steps
+    some of the stored plans are forgotten, and the prior is fitted to the rest: count-based priors anew, so that their
+    counts decay exponentially; neural ones from their present weights. The prior is fitted in place, so that a planner
+    with the same prior changes along. It is not fitted to fewer than two plans.
 
     Args:
         world: the world.
@@ -112,8 +129,7 @@ class Agent:
         self.min_score, self.training, self.time = min_score, dict(training or {}), 0
         prior.check_settings(self.training)
         self.last: Decision | None = None  # the rest of the last plan
-        self.recent: list[Execution] = []  # since a plan was stored last
-        self.before = self.state  # the state then
+        self.recent: list[Steps] = []  # since plans were stored last
 
     def run(self, num_steps: int) -> Execution:
         """Go on for `num_steps` steps, a multiple of `replan_every`.
@@ -130,13 +146,27 @@ class Agent:
             raise ValueError(f"`num_steps` must be a multiple of replan_every = {self.replan_every}, got {num_steps}")
         parts = []
         for _ in range(num_steps // self.replan_every):
+            fresh = self._begin_anew()
             decision = self._decide()
             done = follow(decision, self.world, self.state, self.replan_every, self.generator, self.change)
+            before = torch.cat([self.state[:, None], done.states[:, :-1]], 1)
             self.state, self.last = done.states[:, -1], self._rest(decision)
             self.time += self.replan_every
             parts.append(done)
-            self._learn(done)
+            self._learn(Steps(before, done.actions, done.rewards, fresh))
         return join_executions(parts)
+
+    def _begin_anew(self) -> Tensor:
+        """Begins a new episode where one is over; returns for which agents, `[B]` bool."""
+        over = is_over(self.world, self.state)
+        if over.any():
+            self.state = self.state.clone()
+            self.state[over] = self.world.reset(int(over.sum()), self.generator).to(self.state)
+            if self.last is not None:
+                lengths = torch.full_like(over, self.last.plan.shape[1], dtype=torch.long)
+                lengths = lengths if self.last.lengths is None else self.last.lengths
+                self.last = self.last._replace(lengths=lengths.masked_fill(over, 0))
+        return over
 
     def _decide(self) -> Decision:
         decision = self.planner.plan(self.world, self.state, self.generator)
@@ -153,28 +183,39 @@ class Agent:
         lengths = None if decision.lengths is None else (decision.lengths - self.replan_every).clamp(min=0)
         return decision._replace(plan=decision.plan[:, self.replan_every :], lengths=lengths)
 
-    def _learn(self, done: Execution) -> None:
+    def _learn(self, steps: Steps) -> None:
         """Store what was executed, and fit the prior, when it is time to."""
         if self.learn_every is None:
             return
-        self.recent.append(done)
+        self.recent.append(steps)
         if self.time % self.plan_length:
             return
-        self._store(join_executions(self.recent))
-        self.recent, self.before = [], self.state
+        self._store()
+        self.recent = []
         if self.time % self.learn_every == 0:
             self.replay.forget(self.generator)
             if self.replay.plans is not None and len(self.replay) > 1:
                 self.prior.fit(self.replay.plans, generator=self.generator, **self.training)
 
-    def _store(self, done: Execution) -> None:
-        """Store the plans that were executed from the states `before`."""
-        before = torch.cat([self.before[:, None], done.states[:, :-1]], 1)
-        lengths = executed_steps(self.world, before)
-        kept = lengths > 0
-        if self.min_score is not None:
-            kept &= done.rewards.sum(1) > self.min_score
-        context = observations(self.world, before, self.prior.context_per)
-        plans = Plans(done.actions, self.world.num_actions, lengths, self.world.action_names, context)
-        if kept.any():
-            self.replay.add(plans[kept])
+    def _store(self) -> None:
+        """Store the plans that were executed recently: of each agent one for each episode that it was in."""
+        before, actions, rewards = (
+            torch.cat([getattr(steps, name) for steps in self.recent], 1) for name in ("before", "actions", "rewards")
+        )
+        begins = torch.zeros(actions.shape, dtype=torch.bool, device=actions.device)
+        begins[:, :: self.replan_every] = torch.stack([steps.fresh for steps in self.recent], 1)
+        begins[:, 0] = True
+        alive = ~is_over(self.world, before.flatten(0, 1)).view(actions.shape)
+        # Plans in the order of agents, and then of time; an episode that is over fills up the rest of its plan.
+        row, first = begins.nonzero(as_tuple=True)
+        time = torch.arange(actions.shape[1], device=actions.device)
+        episode = begins.flatten().cumsum(0).view(actions.shape) - 1
+        inside = alive[row] & (episode[row] == torch.arange(len(row), device=actions.device)[:, None])
+        kept, lengths = (inside * rewards[row]).sum(1), inside.sum(1)
+        kept = (lengths > 0) if self.min_score is None else (lengths > 0) & (kept > self.min_score)
+        if not kept.any():
+            return
+        place = row[kept, None], (first[kept, None] + time).clamp(max=actions.shape[1] - 1)
+        context = observations(self.world, before[place], self.prior.context_per)
+        plans = Plans(actions[place], self.world.num_actions, lengths[kept], self.world.action_names, context)
+        self.replay.add(plans)

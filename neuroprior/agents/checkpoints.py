@@ -4,7 +4,6 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +14,12 @@ from safetensors.torch import save as write_tensors
 from torch import Tensor
 
 from neuroprior._files import read_json, write_whole
-from neuroprior.agents.agent import Agent
-from neuroprior.planners import Decision, Execution
+from neuroprior.agents.agent import Agent, Steps
+from neuroprior.planners import Decision
 from neuroprior.plans import Plans
 from neuroprior.priors import serialization
 
-FORMAT, VERSION = "neuroprior agent", 1
-
-PARTS = ("actions", "rewards", "states")
-"""Of what was executed since a plan was stored last."""
+FORMAT, VERSION = "neuroprior agent", 2
 
 
 def save_agent(agent: Agent, folder: str | os.PathLike[str]) -> Path:
@@ -66,7 +62,7 @@ def save_agent(agent: Agent, folder: str | os.PathLike[str]) -> Path:
     write_whole(folder / weights, data)
     document = {"format": FORMAT, "version": VERSION, "time": agent.time, "agent": _settings(agent)}
     document |= {"prior": prior, "prior_sha256": of_prior, "weights": weights, "sha256": digest}
-    document |= {"recent": [done.model_steps for done in agent.recent]}
+    document |= {"recent": len(agent.recent)}
     write_whole(folder / "agent.json", (json.dumps(document, indent=2) + "\n").encode())
     if before and before["weights"] != weights:
         (folder / before["weights"]).unlink(missing_ok=True)
@@ -115,7 +111,7 @@ def restore_agent(agent: Agent, folder: str | os.PathLike[str]) -> Agent:
         tensors = read_tensors(data)
     except SafetensorError as error:
         raise ValueError(f"{path}: not a file of tensors ({error})") from error
-    if sum(name.startswith("recent.") for name in tensors) != len(PARTS) * len(document["recent"]):
+    if sum(name.startswith("recent.") for name in tensors) != len(Steps._fields) * document["recent"]:
         raise ValueError(f"{folder / 'agent.json'}: 'recent' does not fit {path.name}")
     prior = serialization.load(folder / document["prior"], agent.prior.device)
     agent.world.check_state(tensors["state"].to(agent.state.device))
@@ -155,29 +151,26 @@ def _settings(agent: Agent) -> dict[str, Any]:
 
 def _tensors(agent: Agent) -> dict[str, Tensor]:
     """All tensors except the prior's."""
-    found = {"state": agent.state, "before": agent.before, "generator": agent.generator.get_state()}
+    found = {"state": agent.state, "generator": agent.generator.get_state()}
     if agent.last is not None:
         found |= {"last.plan": agent.last.plan}
         found |= {} if agent.last.lengths is None else {"last.lengths": agent.last.lengths}
-    for k, done in enumerate(agent.recent):
-        found |= {f"recent.{k}.{name}": getattr(done, name) for name in PARTS}
+    for k, steps in enumerate(agent.recent):
+        found |= {f"recent.{k}.{name}": values for name, values in steps._asdict().items()}
     return found | {f"replay.{name}": value for name, value in agent.replay.tensors().items()}
 
 
-def _take(agent: Agent, tensors: dict[str, Tensor], steps: Sequence[int]) -> None:
+def _take(agent: Agent, tensors: dict[str, Tensor], num_recent: int) -> None:
     """Restore what `_tensors` gave."""
     on = {name: value.to(agent.state.device) for name, value in tensors.items() if name != "generator"}
     agent.generator.set_state(tensors["generator"])
-    agent.state, agent.before = on["state"], on["before"]
+    agent.state = on["state"]
     agent.last = None
     if "last.plan" in on:
         # Only the actions of the rest of a plan are used.
         nothing = torch.empty(0, device=agent.state.device)
         agent.last = Decision(on["last.plan"], nothing, nothing, 0, on.get("last.lengths"))
-    agent.recent = []
-    for k, number in enumerate(steps):
-        done, rewards, states = (on[f"recent.{k}.{name}"] for name in PARTS)
-        agent.recent.append(Execution(done, rewards, states, number))
+    agent.recent = [Steps(*(on[f"recent.{k}.{name}"] for name in Steps._fields)) for k in range(num_recent)]
     if "replay.actions" in on:
         actions, lengths, context = (on.get(f"replay.{name}") for name in ("actions", "lengths", "context"))
         assert actions is not None
@@ -196,13 +189,11 @@ def _read(path: Path) -> dict[str, Any]:
         "prior_sha256": str,
         "weights": str,
         "sha256": str,
-        "recent": list,
+        "recent": int,
     }
     for key, kind in kinds.items():
         if not isinstance(document.get(key), kind):
             raise ValueError(f"{path}: {key!r} is missing or of a wrong type")
     if document["time"] < 0:
-        raise ValueError(f"{path}: 'time': at least 0 is expected, not {document['time']}")
-    if not all(isinstance(steps, int) for steps in document["recent"]):
-        raise ValueError(f"{path}: 'recent': integers are expected")
+        raise ValueError(f"{path}: 'time' must be at least 0, got {document['time']}")
     return document

@@ -1,8 +1,17 @@
 """Wing 1: recorded behaviour: tables of events, durations, statistics of sequences, tests, the report.
 
-The report is in `neuroprior.behaviour.report`; intervals and tests in `neuroprior.behaviour.analysis.statistics`.
+The report is in `neuroprior.behaviour.report`; intervals and tests in `neuroprior._statistics`.
 """
 
+from neuroprior._statistics import (
+    Difference,
+    Interval,
+    holm,
+    mean_interval,
+    paired_difference,
+    ratio_difference,
+    share_interval,
+)
 from neuroprior.behaviour.analysis.comparison import (
     Baseline,
     Score,
@@ -39,15 +48,6 @@ from neuroprior.behaviour.analysis.modes import (
 )
 from neuroprior.behaviour.analysis.motifs import Motif, motifs
 from neuroprior.behaviour.analysis.permutation_design import PermutationDesign
-from neuroprior.behaviour.analysis.statistics import (
-    Difference,
-    Interval,
-    holm,
-    mean_interval,
-    paired_difference,
-    ratio_difference,
-    share_interval,
-)
 from neuroprior.behaviour.analysis.transitions import Transitions, transitions
 from neuroprior.behaviour.durations.duration_model import DurationLaw, DurationModel
 from neuroprior.behaviour.durations.laws import LAW_NAMES, LawName

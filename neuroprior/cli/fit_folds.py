@@ -18,6 +18,7 @@ from neuroprior.plans import Plans
 from neuroprior.plans.folds import divisible, fair_split, folds
 from neuroprior.plans.sequences import plans_digest
 from neuroprior.priors import Prior
+from neuroprior.priors.learning import plans_for
 
 TRAINED = "trained"
 """The recipe's prior among the models of a fold."""
@@ -66,12 +67,12 @@ def _fit_and_score(fresh: Prior, settings: dict[str, Any], data: Parts, num_cont
     training, index = folds(data.plans, data.folds, data.seed)[fold]
     learned, held_out = divisible(data.plans[training]), data.plans[index]
     generator = torch.Generator().manual_seed(data.seed * 1000 + fold)
-    prior = deepcopy(fresh).fit(learned, generator=generator, **settings)
+    prior = deepcopy(fresh).fit(plans_for(fresh, learned), generator=generator, **settings)
     found = _arrays(TRAINED, prior, held_out)
     for baseline in baselines(*fair_split(learned, data.validation, generator), num_contexts):
         if baseline.prior is not None:
             # Its settings were chosen on the validation plans; then these are learned from as well.
-            found |= _arrays(baseline.model, baseline.prior.fit(learned), held_out)
+            found |= _arrays(baseline.model, baseline.prior.fit(plans_for(baseline.prior, learned)), held_out)
     return found
 
 

@@ -6,12 +6,14 @@ from neuroprior.planners.exhaustive import ExhaustivePlanner
 from neuroprior.planners.frontier import FrontierPlanner
 from neuroprior.planners.horizon_curriculum import HorizonRound, extend_horizon
 from neuroprior.planners.mcts import MCTSPlanner
-from neuroprior.planners.planner import Decision, Planner, PriorPlanner, random_best
+from neuroprior.planners.planner import Candidates, Decision, Planner, PriorPlanner, random_best
 from neuroprior.planners.rollouts import mean_scores
 from neuroprior.planners.sampling import SamplingPlanner
+from neuroprior.planners.sources import Sources
 from neuroprior.planners.tuning import Tuned, best_sampling, proposers, search_weights
 
 __all__ = [
+    "Candidates",
     "Decision",
     "Execution",
     "ExhaustivePlanner",
@@ -21,6 +23,7 @@ __all__ = [
     "Planner",
     "PriorPlanner",
     "SamplingPlanner",
+    "Sources",
     "Tuned",
     "best_sampling",
     "collect",

@@ -528,7 +528,7 @@ def _search_all(
     )
     discounts = np.empty(0)
     if planner.objective == "return":
-        discounts = (planner.discount ** torch.arange(length, dtype=torch.float64)).numpy()
+        discounts = planner.discounts(torch.empty(length, dtype=torch.float64))[:-1].numpy()
     threads = threads if batch * layers * size >= SHARED and on_one_thread(size, actions) else 1
     each = -(-batch // threads)
     descent = Descent(
@@ -652,7 +652,7 @@ def policy_of(prior: Any, world: TabularWorld, temperature: float) -> Policy:
     observed = torch.empty(0)
     if isinstance(prior, HistoryPrior | GRUPrior) and prior.takes_context:
         each_step = prior.context_per == "step"
-        observed = world.observe(torch.arange(world.num_maps * world.num_states))
+        observed = world.context(torch.arange(world.num_maps * world.num_states))
         context = torch.arange(len(observed))
     after, row, logits = torch.zeros(1, actions), torch.zeros(1, 1), torch.zeros(1, actions)
     network: Any = NO_NETWORK

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neuroprior._checks import check_count, check_range, check_sizes, is_number
-from neuroprior.planners.planner import check_objective, value_of
+from neuroprior.planners.planner import settle_objective, value_of
 from neuroprior.worlds.tabular import TabularWorld, check_tabular
 from neuroprior.worlds.world import check_plans
 
@@ -22,8 +22,8 @@ def oracle(
     state: Tensor,
     length: int,
     *,
-    objective: Literal["terminal", "return"] = "terminal",
-    discount: float = 1.0,
+    objective: Literal["terminal", "return"] | None = None,
+    discount: float | None = None,
     value: Callable[[Tensor], Tensor] | None = None,
     any_prefix: bool = False,
 ) -> Tensor:
@@ -53,8 +53,8 @@ def oracle(
         ([0.5, 1.0], [1.0, 1.0])
     """
     check_sizes(length=length)
-    check_objective(objective, discount)
     check_tabular(world)
+    objective, discount = settle_objective(world, objective, discount)
     world.check_state(state)
     maps, states, actions = world.num_maps, world.num_states, world.num_actions
     reward = world.mean_reward()
@@ -81,8 +81,8 @@ def expected_score(
     state: Tensor,
     plans: Tensor,
     *,
-    objective: Literal["terminal", "return"] = "terminal",
-    discount: float = 1.0,
+    objective: Literal["terminal", "return"] | None = None,
+    discount: float | None = None,
     value: Callable[[Tensor], Tensor] | None = None,
     lengths: Tensor | None = None,
 ) -> Tensor:
@@ -109,8 +109,8 @@ def expected_score(
         >>> torch.equal(expected_score(world, start, plans), world.rollout(start, plans).rewards[..., -1])
         True
     """
-    check_objective(objective, discount)
     check_tabular(world)
+    objective, discount = settle_objective(world, objective, discount)
     world.check_state(state)
     check_plans(plans, len(state), world.num_actions)
     batch, num_plans, length = plans.shape

@@ -10,8 +10,7 @@ from neuroprior._checks import check_memory, check_sizes, is_number, kind_of
 from neuroprior._random import generator_on
 from neuroprior.planners.planner import Decision, Planner, check_is_planner
 from neuroprior.plans import Plans
-from neuroprior.plans.sequences import is_per_plan
-from neuroprior.worlds.world import World, check_is_world
+from neuroprior.worlds.world import World, check_is_world, is_over, step_alive
 
 Change = Callable[[Tensor, torch.Generator | None], Tensor]
 """A change of states `[B, ...]` that is not caused by the agents' own steps."""
@@ -95,7 +94,7 @@ def collect(
         world: the world.
         num_plans: plan from so many starts, drawn by `world.reset`.
         state: or plan from these starts, `[N, ...]`.
-        context: what is recorded with the plans: "plan": `world.observe` of the start; "step": of the state before each
+        context: what is recorded with the plans: "plan": `world.context` of the start; "step": of the state before each
             action; None: nothing.
         min_score: keep only plans with a higher score: in worlds where most plans lead nowhere. None: all.
         generator: draws the starts, and whatever the planner draws.
@@ -131,7 +130,8 @@ def collect(
         assert num_plans is not None
         check_memory(8 * num_plans, num_plans=num_plans)
         state = world.reset(num_plans, generator)
-    plan, score, _, _, lengths = planner.plan(world, state, generator)
+    decision = planner.plan(world, state, generator)
+    plan, score, lengths = decision.plan, decision.score, decision.lengths
     _, states = _step_through(world, state, plan, generator)
     before = torch.cat([state[:, None], states[:, :-1]], 1)[:, : plan.shape[1]]
     steps = executed_steps(world, before)
@@ -146,13 +146,7 @@ def collect(
             raise ValueError(f"min_score: none of {len(state)} plans scored more than {min_score}{best}")
         plan, state, before = plan[kept], state[kept], before[kept]
         lengths = None if lengths is None else lengths[kept]
-    seen = None if context is None else world.observe(state[:1])
-    if seen is not None and not is_per_plan(seen) and (context == "plan" or seen.dim() != 2):
-        raise ValueError(
-            "`observe` must give indices [N] or floating point features [N, C]; patterns [N, F] are a"
-            ' context per step (context="step")'
-        )
-    observed = world.observe(state) if context == "plan" else observations(world, before, context)
+    observed = world.context(state) if context == "plan" else observations(world, before, context)
     return Plans(plan, world.num_actions, lengths, world.action_names, observed, world.group(state))
 
 
@@ -173,7 +167,7 @@ def follow(
     short = (lengths < num_steps).nonzero()[:, 0]
     if len(short):  # a plan may be shorter where the episode ends with it
         last = lengths[short]
-        ended = world.terminated(torch.cat([state[:, None], states], 1)[short, last])
+        ended = is_over(world, torch.cat([state[:, None], states], 1)[short, last])
         if not ended.all():
             raise ValueError(
                 f"replan_every: {num_steps} actions are to be executed, but a plan has fewer,"
@@ -199,14 +193,14 @@ def observations(world: World, before: Tensor, context: Literal["plan", "step"] 
     if context is None:
         return None
     if context == "plan":
-        return world.observe(before[:, 0])
-    observed = world.observe(before.flatten(0, 1))
+        return world.context(before[:, 0])
+    observed = world.context(before.flatten(0, 1))
     return observed.view(*before.shape[:2], *observed.shape[1:])
 
 
 def executed_steps(world: World, before: Tensor) -> Tensor:
-    """How many actions are executed until the world terminates, `[N]`; `before [N, L, ...]`: the states before them."""
-    going = ~world.terminated(before.flatten(0, 1)).view(before.shape[:2])
+    """How many actions are executed until the episode is over, `[N]`; `before [N, L, ...]`: the states before them."""
+    going = ~is_over(world, before.flatten(0, 1)).view(before.shape[:2])
     return going.long().cumprod(1).sum(1)
 
 
@@ -233,7 +227,7 @@ def _step_through(
     if plans.shape[1] == 0:
         return torch.zeros(plans.shape, device=state.device), state[:, None][:, :0]
     for t in range(plans.shape[1]):
-        state, reward = world.step(state, plans[:, t].long(), generator)
+        state, reward = step_alive(world, state, plans[:, t].long(), generator)
         state = state if change is None else _changed(change, state, generator)
         rewards.append(reward)
         states.append(state)

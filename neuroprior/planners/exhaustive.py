@@ -10,7 +10,7 @@ from neuroprior._random import generator_on
 from neuroprior.planners.planner import Decision, Objective, Planner, decide, join_decisions, random_best
 from neuroprior.planners.rollouts import mean_scores
 from neuroprior.plans import action_dtype, all_plans
-from neuroprior.worlds.world import World, check_is_world
+from neuroprior.worlds.world import World, allowed_actions, check_is_world, step_alive
 
 MOST_PLANS = 2**24
 
@@ -47,11 +47,11 @@ class ExhaustivePlanner(Planner):
         if actions**self.depth > MOST_PLANS:
             raise ValueError(f"depth: {actions}**{self.depth} plans are too many; at most {MOST_PLANS} can be tried")
         world.check_state(state)
-        generator = generator_on(generator, state.device)
+        planner, generator = self.for_world(world), generator_on(generator, state.device)
         if world.stochastic:
-            plan_some, steps = self._plan_apart, self.num_rollouts * self.depth * actions**self.depth
+            plan_some, steps = planner._plan_apart, self.num_rollouts * self.depth * actions**self.depth
         else:
-            plan_some, steps = self._plan_together, sum(actions**depth for depth in range(1, self.depth + 1))
+            plan_some, steps = planner._plan_together, sum(actions**depth for depth in range(1, self.depth + 1))
         chunks = self.chunks(state, steps, cached=not world.stochastic)
         return join_decisions((plan_some(world, some, generator, steps) for some in chunks), len(state))
 
@@ -65,8 +65,8 @@ class ExhaustivePlanner(Planner):
         found = []
         for depth in range(1, self.depth + 1):
             if not world.all_legal:
-                legal = (legal[:, None] & world.legal_actions(now)).flatten()
-            now, reward = world.step(_for_each(actions, now), all_actions.repeat(len(now)), generator)
+                legal = (legal[:, None] & allowed_actions(world, now)).flatten()
+            now, reward = step_alive(world, _for_each(actions, now), all_actions.repeat(len(now)), generator)
             # A terminal score depends on the last reward only.
             before = _for_each(actions, rewards if self.objective == "return" else rewards[:, :0])
             rewards = torch.cat([before, reward[:, None]], 1)

@@ -8,11 +8,19 @@ from torch import Tensor
 from neuroprior._checks import check_flags
 from neuroprior._hashing import row_hashes
 from neuroprior._random import gumbel
-from neuroprior.planners.planner import Decision, Objective, PriorPlanner, as_floats, join_decisions, random_best
+from neuroprior.planners.planner import (
+    Candidates,
+    Decision,
+    Objective,
+    PriorPlanner,
+    as_floats,
+    join_decisions,
+    random_best,
+)
 from neuroprior.plans import action_dtype
 from neuroprior.sampling.states import select_rows
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
-from neuroprior.worlds.world import World
+from neuroprior.worlds.world import World, step_alive
 
 
 class FrontierPlanner(PriorPlanner):
@@ -63,12 +71,12 @@ class FrontierPlanner(PriorPlanner):
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
         if world.stochastic:
             raise ValueError("`world` must be deterministic: plans that reach the same state are merged")
-        generator = self._check(world, state, generator)
+        planner, generator = self._prepare(world, state, generator)
         widths = self._widths(world.num_actions)
         steps = sum(widths)
         chunks = self.chunks(state, steps)
         with self._threads_for(max(map(len, chunks)) * max(widths)):
-            return join_decisions((self._plan(world, some, generator, steps) for some in chunks), len(state))
+            return join_decisions((planner._plan(world, some, generator, steps) for some in chunks), len(state))
 
     def _widths(self, actions: int) -> list[int]:
         """How many continuations are tried at each step."""
@@ -96,7 +104,7 @@ class FrontierPlanner(PriorPlanner):
                 found.append(self._best(front, generator))
             if t + 1 < self.length:
                 rewards = as_floats(front.rewards)
-                gained = rewards.double() @ self._weights(rewards).double()
+                gained = rewards.double() @ self.discounts(rewards)[:-1].double()
                 front = front.merge(gained if self.objective == "return" else None)
                 logits, hidden = stepper.step_in(world, action, select_rows(hidden, row), front.state)
         score = torch.stack([decision.score for decision in found], 1)
@@ -106,7 +114,12 @@ class FrontierPlanner(PriorPlanner):
             torch.stack([getattr(decision, name) for decision in found], 1)[row, best]
             for name in ("plan", "final_state")
         )
-        return Decision(plan, score[row, best], final, steps, best + 1 if self.any_prefix else None)
+        candidates = None
+        if self.keep_candidates:
+            states = front.state.view(*front.log_prob.shape, *front.state.shape[1:])
+            kept = self.score(front.rewards, states).masked_fill(front.log_prob == -torch.inf, -torch.inf)
+            candidates = Candidates(front.plans, kept)
+        return Decision(plan, score[row, best], final, steps, best + 1 if self.any_prefix else None, candidates)
 
     def _extend(
         self, world: World, front: "_Front", logits: Tensor, width: int, generator: torch.Generator
@@ -118,7 +131,7 @@ class FrontierPlanner(PriorPlanner):
         height = gumbel(log_prob, generator) if self.noise else log_prob
         index = height.topk(width).indices
         row, action = _parents(index, front.log_prob.shape[1], world.num_actions)
-        state, reward = world.step(front.state.index_select(0, row), action, generator)
+        state, reward = step_alive(world, front.state.index_select(0, row), action, generator)
         return front.extend(row, action, log_prob.gather(1, index), state, reward), row, action
 
     def _best(self, front: "_Front", generator: torch.Generator) -> Decision:

@@ -11,7 +11,7 @@ from neuroprior.sampling.draws import Draw
 from neuroprior.sampling.states import State, StateStore, join_rows, numbers_in, select_rows
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
 from neuroprior.worlds.tabular import TabularWorld
-from neuroprior.worlds.world import Rollout, World
+from neuroprior.worlds.world import Rollout, World, allowed_actions, step_alive
 
 PER_ACTION = 64
 """So many numbers of a prior's state count as one action where memory is planned: states are kept only at nodes that
@@ -71,15 +71,15 @@ class MCTSPlanner(PriorPlanner):
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
         if world.stochastic:
             raise ValueError("`world` must be deterministic: a node of the tree is one state")
-        generator = self._check(world, state, generator)
+        planner, generator = self._prepare(world, state, generator)
         from neuroprior.planners import compiled_mcts
 
-        whole = compiled_mcts.can_search(self, world, state)
+        whole = compiled_mcts.can_search(planner, world, state)
         numbers = world.num_actions  # that each node has
         if not whole:
             numbers = max(numbers, self._state_size(world, state) // PER_ACTION)
         chunks = self.chunks(state, self.num_plans * self.length * numbers)
-        return join_decisions((self._plan(whole, world, some, generator) for some in chunks), len(state))
+        return join_decisions((planner._plan(whole, world, some, generator) for some in chunks), len(state))
 
     @torch.no_grad()
     def _state_size(self, world: World, state: Tensor) -> int:
@@ -104,7 +104,8 @@ class MCTSPlanner(PriorPlanner):
         plans, rewards, states, done = found
         rollout = Rollout(states[:, :, -1], rewards, states if self.any_prefix else None)
         score, ends = self.score_rollout(rollout)
-        return decide(plans, score, ends, steps, generator, done[..., None] if self.any_prefix else done)
+        allowed = done[..., None] if self.any_prefix else done
+        return decide(plans, score, ends, steps, generator, allowed, self.keep_candidates)
 
 
 class _Trees:
@@ -243,7 +244,7 @@ class _Trees:
             now = torch.cat([now, self.state[own.to(device), node.to(device)]])
             going = torch.cat([going, fresh])
             action, place = plan[going, t].to(device), going.to(device)
-            now, gained = self.world.step(now, action, self.generator)
+            now, gained = step_alive(self.world, now, action, self.generator)
             self.reward, rewards = self.reward.to(gained.dtype), rewards.to(gained.dtype)
             rewards[place, t], states[place, t] = gained, now
             self.left[rows[going]] -= 1
@@ -262,7 +263,7 @@ class _Trees:
         """`logits [N, A]`, -inf for actions that are not legal in `state [N, ...]`."""
         logits = legal_logits(self.world, state, logits)
         if not self.world.all_legal and (logits == -torch.inf).all(1).any():
-            raise ValueError("prior: in some state all legal actions have probability 0, or the world has none there")
+            raise ValueError("prior: in some state all legal actions have probability 0")
         if logits.isnan().any():
             raise ValueError("prior: its logits are NaN")
         return logits
@@ -274,7 +275,7 @@ class _Trees:
         self.probs[rows, node] = (logits.double() / self.planner.temperature).softmax(-1).cpu()
         if not self.world.all_legal:
             state = self.state[rows.to(self.device), node.to(self.device)]
-            self.closed[rows, node] = ~self.world.legal_actions(state).cpu()
+            self.closed[rows, node] = ~allowed_actions(self.world, state).cpu()
         self.place[rows, node] = self.kept.keep(depth, hidden)
 
     def _make_room(self) -> None:

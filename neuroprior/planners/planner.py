@@ -3,7 +3,8 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Literal, NamedTuple, TypedDict, Unpack
+from copy import copy
+from typing import Literal, NamedTuple, Self, TypedDict, Unpack
 
 import torch
 from torch import Tensor
@@ -18,6 +19,34 @@ STEPS_CACHED = 2**19
 """Simulator steps whose results stay in a CPU's cache."""
 
 
+class Candidates(NamedTuple):
+    """What a planner tried from B starts: P plans of L actions from each.
+
+    Attributes:
+        plans: `[B, P, L]`; zeros where there is none.
+        scores: `[B, P]`, with `any_prefix` those of the best prefixes; -inf: there is no such plan, or it is not legal.
+
+    Example:
+        >>> tried = Candidates(torch.tensor([[[1, 0], [1, 1], [2, 0]]]), torch.tensor([[2.0, 4.0, 1.0]]))
+        >>> tried.visits(4).tolist(), tried.values(4).tolist()
+        ([[0, 2, 1, 0]], [[nan, 3.0, 1.0, nan]])
+    """
+
+    plans: Tensor
+    scores: Tensor
+
+    def visits(self, num_actions: int) -> Tensor:
+        """How many plans begin with each action: int64 `[B, A]`. Of tree search they are a policy to learn from."""
+        counts = torch.zeros(len(self.plans), num_actions, dtype=torch.long, device=self.plans.device)
+        return counts.scatter_add_(1, self.plans[:, :, 0].long(), (self.scores > -torch.inf).long())
+
+    def values(self, num_actions: int) -> Tensor:
+        """The mean score of the plans that begin with each action: `[B, A]`; NaN where there is none."""
+        scores = self.scores.masked_fill(self.scores == -torch.inf, 0)
+        sums = scores.new_zeros(len(scores), num_actions).scatter_add_(1, self.plans[:, :, 0].long(), scores)
+        return sums / self.visits(num_actions)
+
+
 class Decision(NamedTuple):
     """What a planner decided for B starts.
 
@@ -29,6 +58,7 @@ class Decision(NamedTuple):
             world, in the first of the planner's rollouts.
         model_steps: single simulator steps taken for each start.
         lengths: `[B]`: how many actions of each plan are to be executed; None: all.
+        candidates: all that was tried, where `Planner.keep_candidates` is set; else None.
     """
 
     plan: Tensor
@@ -36,13 +66,19 @@ class Decision(NamedTuple):
     final_state: Tensor
     model_steps: int
     lengths: Tensor | None = None
+    candidates: Candidates | None = None
+
+    def __repr__(self) -> str:
+        batch, length = self.plan.shape
+        mean = f"mean score {float(self.score.double().mean()):.4g}, " if batch else ""
+        return f"Decision({batch:,} plans of {length} actions, {mean}{self.model_steps:,} model steps each)"
 
 
 class Objective(TypedDict, total=False):
     """What a planner optimises, as keyword arguments; see `Planner`."""
 
-    objective: Literal["terminal", "return"]
-    discount: float
+    objective: Literal["terminal", "return"] | None
+    discount: float | None
     value: Callable[[Tensor], Tensor] | None
     any_prefix: bool
 
@@ -52,8 +88,9 @@ class Planner(ABC):
 
     Args:
         objective: "terminal": the score of a plan is the reward of its last step (Hyvärinen, both simulations).
-            "return": the sum of its rewards, that of step t (from 0) times `discount ** t`.
-        discount: above 0, at most 1; only for "return".
+            "return": the sum of its rewards, that of step t (from 0) times `discount ** t`. None: what the world
+            declares, see `World.objective`.
+        discount: above 0, at most 1; only for "return". None: that of the world.
         value: its value of the final state is added to the score: a function from final states `[N, ...]` to `[N]`;
             with "return" it is multiplied by `discount ** L`.
         any_prefix: the agent may stop after any action but none at all: the score of a plan is that of its best prefix,
@@ -61,17 +98,20 @@ class Planner(ABC):
 
     Attributes:
         steps_at_once: starts are planned for in chunks of about so many simulator steps; bounds memory.
+        keep_candidates: whether decisions hold the `Candidates`, too; of `SamplingPlanner`, `MCTSPlanner` and
+            `FrontierPlanner` (the plans of full length that it kept to the end).
 
     Raises:
         ValueError: an argument is out of range.
     """
 
     steps_at_once: int = 2**22
+    keep_candidates: bool = False
 
     def __init__(
         self,
-        objective: Literal["terminal", "return"] = "terminal",
-        discount: float = 1.0,
+        objective: Literal["terminal", "return"] | None = None,
+        discount: float | None = None,
         value: Callable[[Tensor], Tensor] | None = None,
         any_prefix: bool = False,
     ) -> None:
@@ -91,6 +131,15 @@ class Planner(ABC):
             "any_prefix": self.any_prefix,
         }
 
+    def for_world(self, world: World) -> Self:
+        """Returns this planner with the objective and discount of `world` where it has none of its own.
+
+        `plan` begins with it, since scores need to know what counts.
+        """
+        planner = copy(self)
+        planner.objective, planner.discount = settle_objective(world, self.objective, self.discount)
+        return planner
+
     @abstractmethod
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
         """Plan from each of B starts.
@@ -106,18 +155,19 @@ class Planner(ABC):
 
     def score(self, rewards: Tensor, final_state: Tensor) -> Tensor:
         """The scores `[...]` of plans with `rewards [..., L]` that end in `final_state` (`[...]` and its own shape)."""
-        length, rewards = rewards.shape[-1], as_floats(rewards)
-        if self.objective == "terminal":
+        rewards = as_floats(rewards)
+        if self._counts_last():
             return self._add_value(rewards[..., -1], final_state)
-        return self._add_value((rewards * self._weights(rewards)).sum(-1), final_state, self.discount**length)
+        weights = self.discounts(rewards)
+        return self._add_value((rewards * weights[:-1]).sum(-1), final_state, weights[-1])
 
     def prefix_scores(self, rewards: Tensor, states: Tensor) -> Tensor:
         """The scores `[..., L]` of all prefixes of plans that have `rewards [..., L]` and lead to `states [..., L]`."""
         rewards = as_floats(rewards)
-        if self.objective == "terminal":
+        if self._counts_last():
             return self._add_value(rewards, states)
-        weights = self._weights(rewards)
-        return self._add_value((rewards * weights).cumsum(-1), states, self.discount * weights)
+        weights = self.discounts(rewards)
+        return self._add_value((rewards * weights[:-1]).cumsum(-1), states, weights[1:])
 
     def score_rollout(self, rollout: Rollout) -> tuple[Tensor, Tensor]:
         """Scores and final states for `decide`: of all prefixes where the rollout has states, else of plans."""
@@ -139,8 +189,16 @@ class Planner(ABC):
         parts: tuple[Tensor, ...] = state.split(max(at_once // max(steps, 1), 1))
         return parts
 
-    def _weights(self, rewards: Tensor) -> Tensor:
-        return self.discount ** torch.arange(rewards.shape[-1], device=rewards.device, dtype=rewards.dtype)
+    def discounts(self, rewards: Tensor) -> Tensor:
+        """The weights in a return, `[L + 1]`: those of `rewards [..., L]`, and that of the final state's value."""
+        steps = torch.arange(rewards.shape[-1] + 1, device=rewards.device, dtype=rewards.dtype)
+        return (1.0 if self.discount is None else self.discount) ** steps
+
+    def _counts_last(self) -> bool:
+        """Whether the last of the rewards is the score."""
+        if self.objective is None:
+            raise ValueError("objective: it is the world's; score with `planner.for_world(world)`")
+        return self.objective == "terminal"
 
     def _add_value(self, score: Tensor, state: Tensor, weight: Tensor | float = 1.0) -> Tensor:
         """`score [...]` plus the weighted value of `state` (`[...]` and its own shape)."""
@@ -180,10 +238,14 @@ class PriorPlanner(Planner):
         """As `Stepper.threads_for`, but all threads where a value of the user's may be worth them."""
         return nullcontext() if self.value is not None else Stepper(self.prior).threads_for(num_plans)
 
-    def _check(self, world: World, state: Tensor, generator: torch.Generator | None) -> torch.Generator:
-        """Raise ValueError unless the prior can act in the world from `state`; the generator to draw with."""
+    def _prepare(self, world: World, state: Tensor, generator: torch.Generator | None) -> tuple[Self, torch.Generator]:
+        """Returns the planner for the world, and the generator to draw with.
+
+        Raises:
+            ValueError: the prior cannot act in the world from `state`.
+        """
         check_in_world(self.prior, world, state)
-        return generator_on(generator, state.device)
+        return self.for_world(world), generator_on(generator, state.device)
 
 
 def as_floats(rewards: Tensor) -> Tensor:
@@ -211,13 +273,28 @@ def value_of(value: Callable[[Tensor], Tensor], state: Tensor, name: str = "valu
     return values.view(-1)
 
 
-def check_objective(objective: str, discount: float) -> None:
+def settle_objective(
+    world: World, objective: Literal["terminal", "return"] | None, discount: float | None
+) -> tuple[Literal["terminal", "return"], float]:
+    """Returns the objective and the discount: those of `world` where they are None.
+
+    Raises:
+        ValueError: they are out of range, or the discount has no effect.
+    """
+    settled = world.objective if objective is None else objective
+    if discount is None:
+        discount = world.discount if settled == "return" else 1.0
+    check_objective(settled, discount)
+    return settled, discount
+
+
+def check_objective(objective: str | None, discount: float | None) -> None:
     """Raise ValueError for an unknown `objective`, or a `discount` that is out of range or has no effect."""
-    if objective not in ("terminal", "return"):
+    if objective not in (None, "terminal", "return"):
         raise ValueError(f'`objective` must be "terminal" or "return", got {objective!r}')
-    if not is_number(discount) or not 0 < discount <= 1:
+    if discount is not None and (not is_number(discount) or not 0 < discount <= 1):
         raise ValueError(f"`discount` must be a number above 0 and at most 1, got {discount!r}")
-    if objective == "terminal" and discount != 1:
+    if objective == "terminal" and discount not in (None, 1):
         raise ValueError('discount: it has no effect with objective="terminal"; use objective="return"')
 
 
@@ -242,8 +319,8 @@ def random_best(score: Tensor, generator: torch.Generator, allowed: Tensor | Non
     allowed = None if allowed is None else allowed.expand(score.shape)
     if allowed is not None and not allowed.any(1).all():
         raise ValueError(
-            "plans: from some start there is no plan of legal actions alone; a world's `legal_actions` are at least one"
-            " in each state, and a prior's probability is not 0 for all of these"
+            "plans: from some start there is no plan of legal actions alone, to which the prior gives a probability"
+            " above 0"
         )
     # Scores are often one column of many, which is slow to read more than once.
     score = score.contiguous() if allowed is None else score.masked_fill(~allowed, -torch.inf)
@@ -271,6 +348,7 @@ def decide(
     model_steps: int,
     generator: torch.Generator,
     allowed: Tensor | None = None,
+    keep: bool = False,
 ) -> Decision:
     """The best of the candidates, or of their prefixes.
 
@@ -281,25 +359,30 @@ def decide(
         model_steps: simulator steps taken for each start.
         generator: breaks ties.
         allowed: bool, of the shape of `score` or broadcast to it: what may win, at least one per start; None: all.
+        keep: whether the decision holds the candidates.
     """
-    row = torch.arange(len(plans), device=plans.device)
+    row, candidates = torch.arange(len(plans), device=plans.device), None
+    if keep:
+        counting = score if allowed is None else score.masked_fill(~allowed.expand(score.shape), -torch.inf)
+        scores = counting if score.dim() == 2 else counting.amax(2)
+        candidates = Candidates(plans.masked_fill((scores == -torch.inf)[..., None], 0), scores)
     if allowed is not None:
         allowed = allowed.expand(score.shape).flatten(1)
     if score.dim() == 2:
         best = random_best(score, generator, allowed)
-        return Decision(plans[row, best], score[row, best], ends[row, best], model_steps)
+        return Decision(plans[row, best], score[row, best], ends[row, best], model_steps, None, candidates)
     length = plans.shape[2]
     score = score.flatten(1)
     chosen = random_best(score, generator, allowed)
     best, last = chosen.div(length, rounding_mode="floor"), chosen % length
     beyond = torch.arange(length, device=plans.device) > last[:, None]
     plan = plans[row, best].masked_fill(beyond, 0)
-    return Decision(plan, score[row, chosen], ends[row, best, last], model_steps, last + 1)
+    return Decision(plan, score[row, chosen], ends[row, best, last], model_steps, last + 1, candidates)
 
 
 def join_decisions(parts: Iterable[Decision], batch_size: int) -> Decision:
     """The decisions for chunks of `batch_size` starts as one; its model steps are the most of any chunk."""
-    whole, at, steps = None, 0, 0
+    whole, at, steps, kept = None, 0, 0, list[Candidates]()
     for part in parts:
         if len(part.plan) == batch_size:
             return part
@@ -308,9 +391,20 @@ def join_decisions(parts: Iterable[Decision], batch_size: int) -> Decision:
             plan, score, final_state = (values.new_empty(batch_size, *values.shape[1:]) for values in part[:3])
             lengths = None if part.lengths is None else part.lengths.new_empty(batch_size)
             whole = Decision(plan, score, final_state, 0, lengths)
+        if part.candidates is not None:
+            kept.append(part.candidates)
         for result, values in zip((*whole[:3], whole.lengths), (*part[:3], part.lengths), strict=True):
             if isinstance(result, Tensor) and isinstance(values, Tensor):
                 result[at : at + len(part.plan)] = values
         at, steps = at + len(part.plan), max(steps, part.model_steps)
     assert whole is not None
-    return whole._replace(model_steps=steps)
+    return whole._replace(model_steps=steps, candidates=_join_candidates(kept) if kept else None)
+
+
+def _join_candidates(parts: list[Candidates]) -> Candidates:
+    """The candidates for chunks of starts as one; where there are fewer, -inf says that there is no plan."""
+    most = max(part.scores.shape[1] for part in parts)
+    pad = torch.nn.functional.pad
+    plans = [pad(part.plans, (0, 0, 0, most - part.plans.shape[1])) for part in parts]
+    scores = [pad(part.scores, (0, most - part.scores.shape[1]), value=-torch.inf) for part in parts]
+    return Candidates(torch.cat(plans), torch.cat(scores))

@@ -41,6 +41,7 @@ def mean_scores(
         >>> scores.shape
         torch.Size([1, 2])
     """
+    planner = planner.for_world(world)
     if not world.stochastic:
         return planner.score_rollout(world.rollout(state, plans, generator, planner.any_prefix))
     if not world.all_legal:

@@ -1,5 +1,6 @@
 """The sampling planner: draws candidate plans from a prior and decides for the best of them."""
 
+from collections.abc import Sequence
 from typing import Unpack
 
 import torch
@@ -8,9 +9,10 @@ from torch import Tensor
 from neuroprior._checks import check_flags, check_share, check_sizes
 from neuroprior.planners.planner import Decision, Objective, PriorPlanner, decide, join_decisions
 from neuroprior.planners.rollouts import halved_scores, halving_rounds, mean_scores
+from neuroprior.planners.sources import Sources
 from neuroprior.priors.uniform import UniformPrior
 from neuroprior.sampling.ancestral import sample, sample_in_world
-from neuroprior.sampling.stepping import Steppable, Stepper
+from neuroprior.sampling.stepping import Steppable, Stepper, check_in_world
 from neuroprior.worlds.world import Rollout, World
 
 
@@ -23,8 +25,12 @@ class SamplingPlanner(PriorPlanner):
     In a stochastic world a plan is a sequence of actions that is executed whatever happens. A prior with a context
     draws each plan along one random trajectory; all plans are then scored by new rollouts.
 
+    Several priors, given as a list, share the candidates of a decision with a uniform one, see `Sources`: those that
+    had the best candidate more often draw more of the next. So a prior that was learned from few plans, or in a world
+    that has changed since, costs little.
+
     Args:
-        prior: proposes the candidates; `UniformPrior(A)` makes the random planner.
+        prior: proposes the candidates; `UniformPrior(A)` makes the random planner. Or a list of priors.
         length: number of actions in a plan, at least 1.
         num_plans: number of candidates for each start, at least 1.
         num_rollouts: in a stochastic world, the score of a plan is its mean over so many rollouts, with common random
@@ -34,6 +40,7 @@ class SamplingPlanner(PriorPlanner):
         temperature: divides the prior's logits.
         uniform_share: the share, from 0 to 1, of the candidates that are uniform plans instead, rounded to a whole
             number of them: what the prior holds to be impossible is tried, too (a defensive mixture: Hesterberg 1995).
+            Not with several priors.
         **goal: objective, discount, value, any_prefix: see `Planner`.
 
     Raises:
@@ -48,7 +55,7 @@ class SamplingPlanner(PriorPlanner):
 
     def __init__(
         self,
-        prior: Steppable,
+        prior: Steppable | Sequence[Steppable],
         length: int,
         num_plans: int,
         *,
@@ -58,18 +65,33 @@ class SamplingPlanner(PriorPlanner):
         uniform_share: float = 0.0,
         **goal: Unpack[Objective],
     ) -> None:
-        super().__init__(prior, length, num_plans, temperature=temperature, **goal)
+        self.sources = Sources(prior) if isinstance(prior, Sequence) else None
+        first = prior[0] if isinstance(prior, Sequence) else prior
+        super().__init__(first, length, num_plans, temperature=temperature, **goal)
         check_sizes(num_rollouts=num_rollouts)
         check_flags(halving=halving)
         check_share("uniform_share", uniform_share)
+        if self.sources is not None and (halving or uniform_share):
+            raise ValueError("`halving` and `uniform_share` must be left out where there are several priors")
         self.num_rollouts, self.halving, self.uniform_share = num_rollouts, halving, uniform_share
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
-        generator = self._check(world, state, generator)
-        steps = self.model_steps(world)
-        chunks = self.chunks(state, steps)
-        decisions = (decide(*self.candidates(world, some, generator), steps, generator) for some in chunks)
-        return join_decisions(decisions, len(state))
+        _, generator = self._prepare(world, state, generator)
+        if self.sources is not None:
+            for prior in self.sources.priors[1:]:
+                check_in_world(prior, world, state)
+        steps, chunks, wins = self.model_steps(world), self.chunks(state, self.model_steps(world)), list[Tensor]()
+
+        def plan_some(some: Tensor) -> Decision:
+            plans, score, ends = self.candidates(world, some, generator)
+            if self.sources is not None:
+                wins.append(wins_of(score, self.sources.counts(world, self.num_plans)))
+            return decide(plans, score, ends, steps, generator, keep=self.keep_candidates)
+
+        decision = join_decisions(map(plan_some, chunks), len(state))
+        if self.sources is not None:
+            self.sources.learn(world, torch.stack(wins).sum(0))
+        return decision
 
     def candidates(self, world: World, state: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
         """Candidate plans `[B, P, L]` for the starts `state [B, ...]`, their scores and final states.
@@ -77,14 +99,11 @@ class SamplingPlanner(PriorPlanner):
         Scores and final states are `[B, P]`, those of all prefixes `[B, P, L]` with `any_prefix`; final states have the
         state's own dimensions behind these. With halving, only the plans of the last round are returned.
         """
-        uniform = uniform_plans(self.uniform_share, self.num_plans)
-        drawn = []
-        if uniform < self.num_plans:
-            number = self.num_plans - uniform
-            drawn.append(self._drawn(self.prior, number, self.temperature, world, state, generator))
-        if uniform:
-            even = UniformPrior(world.num_actions).to(Stepper(self.prior).device)
-            drawn.append(self._drawn(even, uniform, 1.0, world, state, generator))
+        drawn = [
+            self._drawn(prior, number, temperature, world, state, generator)
+            for prior, number, temperature in self._proposals(world)
+            if number
+        ]
         if not world.stochastic:
             scored = [self._scored(plans, rollout, world, state, generator) for plans, rollout in drawn]
             plans, score, ends = (
@@ -96,6 +115,18 @@ class SamplingPlanner(PriorPlanner):
         if self.halving:
             return halved_scores(self, world, state, plans, self.num_rollouts, generator)
         return plans, *mean_scores(self, world, state, plans, self.num_rollouts, generator)
+
+    def _proposals(self, world: World) -> list[tuple[Steppable, int, float]]:
+        """The priors that draw candidates, how many each draws, and at which temperature."""
+        if self.sources is not None:
+            counts = self.sources.counts(world, self.num_plans)
+            pairs = zip(self.sources.priors, counts, strict=True)
+            return [(one, n, 1.0 if isinstance(one, UniformPrior) else self.temperature) for one, n in pairs]
+        uniform = uniform_plans(self.uniform_share, self.num_plans)
+        proposals: list[tuple[Steppable, int, float]] = [(self.prior, self.num_plans - uniform, self.temperature)]
+        if uniform:
+            proposals.append((UniformPrior(world.num_actions).to(Stepper(self.prior).device), uniform, 1.0))
+        return proposals
 
     def _drawn(
         self, prior: Steppable, number: int, temperature: float, world: World, state: Tensor, generator: torch.Generator
@@ -120,7 +151,7 @@ class SamplingPlanner(PriorPlanner):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The plans, their scores and final states in a deterministic world."""
         if rollout is not None:
-            return plans, *self.score_rollout(rollout)
+            return plans, *self.for_world(world).score_rollout(rollout)
         return plans, *mean_scores(self, world, state, plans, self.num_rollouts, generator)
 
     def model_steps(self, world: World) -> int:
@@ -130,9 +161,22 @@ class SamplingPlanner(PriorPlanner):
         tries = self.num_plans * self.num_rollouts
         if self.halving:
             tries = sum(kept * times for kept, times in halving_rounds(self.num_plans, self.num_rollouts))
-        drawn_in_world = Stepper(self.prior).context_per is not None
-        own = self.num_plans - uniform_plans(self.uniform_share, self.num_plans)
-        return (tries + own * drawn_in_world) * self.length
+        proposals = self._proposals(world)
+        in_world = sum(number for prior, number, _ in proposals if Stepper(prior).context_per is not None)
+        return (tries + in_world) * self.length
+
+
+def wins_of(score: Tensor, counts: list[int]) -> Tensor:
+    """In how many decisions each source had the best candidate: float64 `[K]`; of equally good ones each has its part.
+
+    Args:
+        score: `[B, P]`, or `[B, P, L]` of all prefixes.
+        counts: how many of the P candidates each source drew, one after the other.
+    """
+    score = score if score.dim() == 2 else score.amax(2)
+    best = (score == score.amax(1, keepdim=True)).double()
+    best = best / best.sum(1, keepdim=True)
+    return torch.stack([part.sum() for part in best.split(counts, 1)])
 
 
 def uniform_plans(share: float, num_plans: int) -> int:

@@ -8,7 +8,7 @@ from neuroprior.planners.planner import Decision, Planner, decide, random_best
 from neuroprior.planners.rollouts import mean_scores
 from neuroprior.sampling.draws import Draw
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
-from neuroprior.worlds.world import Rollout, World, join_states
+from neuroprior.worlds.world import Rollout, World, allowed_actions, join_states, step_alive
 
 
 @torch.no_grad()
@@ -41,8 +41,9 @@ def continue_plans(
         action = draw.actions(logits)
         if t < rest.shape[1]:
             given = rest[:, t].long()
-            action = torch.where((t < left) & world.legal_actions(now).gather(1, given[:, None])[:, 0], given, action)
-        now, reward = world.step(now, action, generator)
+            may = (t < left) & allowed_actions(world, now).gather(1, given[:, None])[:, 0]
+            action = torch.where(may, given, action)
+        now, reward = step_alive(world, now, action, generator)
         for column, values in zip(columns, (action.to(draw.dtype), reward, now), strict=True):
             column.append(values)
         if t + 1 < length:
@@ -81,7 +82,7 @@ def with_rest(
     """
     if decision.lengths is not None and not planner.any_prefix:
         return decision
-    generator = generator_on(generator, state.device)
+    planner, generator = planner.for_world(world), generator_on(generator, state.device)
     length = decision.plan.shape[1]
     plans, rollout = continue_plans(prior, world, state, rest, left, length, generator)
     steps = decision.model_steps + length

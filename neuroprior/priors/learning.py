@@ -1,10 +1,17 @@
 """The plans that a prior learns from, counts in or is chosen on: checked, and without a context it does not take."""
 
+import sys
+import warnings
+
+import torch
 from torch import Tensor
 
-from neuroprior._checks import check_same_names
+from neuroprior._checks import check_same_names, is_integer
 from neuroprior.plans import Plans, constant_context
 from neuroprior.priors.prior import Prior, check_actions
+
+MOST_NEW, FEWEST_PLANS = 0.9, 20
+"""A context is no category where so large a share of the actions has one that no other of so many plans has."""
 
 
 def training_plans(prior: Prior, plans: Plans | Tensor, *, further: bool = False) -> Plans:
@@ -18,7 +25,12 @@ def training_plans(prior: Prior, plans: Plans | Tensor, *, further: bool = False
     Raises:
         ValueError: another number of actions, other names than those from which it learns further, or a context of
             another kind than the prior takes.
+
+    Warns:
+        UserWarning: the prior ignores the context of the plans, or nearly every context occurs in one plan alone.
     """
+    if isinstance(plans, Plans):
+        _warn_of_context(prior, plans)
     plans = _as_taken(prior, plans)
     check_actions(prior, plans)
     known = prior.action_names if further else None
@@ -77,7 +89,49 @@ def counted_plans(prior: Prior, plans: Plans | Tensor) -> Plans:
     return plans
 
 
-def _as_taken(prior: Prior, plans: Plans | Tensor) -> Plans:
-    """`plans` as `Plans`, without a context that the prior does not take."""
-    plans = prior.as_plans(plans)
+def plans_for(prior: Prior, plans: Plans) -> Plans:
+    """`plans` without a context that the prior does not take."""
     return plans if prior.takes_context else plans.without_context()
+
+
+def _as_taken(prior: Prior, plans: Plans | Tensor) -> Plans:
+    """As `plans_for`, as `Plans` on the prior's device."""
+    return plans_for(prior, prior.as_plans(plans))
+
+
+def _warn_of_context(prior: Prior, plans: Plans) -> None:
+    """Warn of a context that is ignored, or that can hardly be learned from."""
+    if plans.context is None:
+        return
+    if not prior.takes_context:
+        _warn(
+            f"{type(prior).__name__}: it ignores the context of the plans; make it with num_contexts= or"
+            " context_size=, if it takes these, or leave the context out (plans.without_context())"
+        )
+    elif prior.num_contexts is not None and is_integer(plans.context) and _seldom_repeats(prior, plans):
+        _warn(
+            f"{type(prior).__name__}: nearly every context occurs in one plan alone, so that nothing is learned from"
+            " it; where it is no category, give features (a floating point context, or Features(size) in a world)"
+        )
+
+
+def _warn(message: str) -> None:
+    """Warn where the library was called from."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("neuroprior."):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, stacklevel=level)
+
+
+def _seldom_repeats(prior: Prior, plans: Plans) -> bool:
+    """Whether nearly all actions are taken in contexts that occur in one plan alone."""
+    assert plans.context is not None
+    mask = plans.mask()
+    number = torch.arange(len(plans), device=mask.device)[:, None].expand(mask.shape)[mask]
+    context = plans.context[mask].long()
+    if len(plans) < FEWEST_PLANS or 2 * (prior.num_contexts or 0) < len(context):
+        return False
+    pairs = torch.stack([context, number], 1).unique(dim=0)
+    _, place, num_plans = pairs[:, 0].unique(return_inverse=True, return_counts=True)
+    alone = torch.isin(context, pairs[num_plans[place] == 1, 0])
+    return float(alone.double().mean()) > MOST_NEW

@@ -149,6 +149,9 @@ class Prior(SavedModule):
 
         Returns:
             Logits `[N, A]` of the first action, and the state of N plans.
+
+        Raises:
+            ValueError: a context that the prior does not know, or none where it takes one.
         """
 
     @abstractmethod
@@ -162,6 +165,9 @@ class Prior(SavedModule):
 
         Returns:
             Logits `[N, A]` of the next action, and the next state.
+
+        Raises:
+            ValueError: an action or a context that the prior does not know.
         """
 
     def advance(self, action: Tensor, state: Any, context: Tensor | None = None, room: int = 0) -> tuple[Tensor, Any]:
@@ -296,6 +302,8 @@ class Prior(SavedModule):
         context: Tensor | None = None,
         *,
         past: Tensor | None = None,
+        state: tuple[Tensor, Any] | None = None,
+        mask: Tensor | sampling.Mask | None = None,
         temperature: float = 1.0,
         generator: torch.Generator | None = None,
         method: Literal["auto", "ancestral", "tree"] = "auto",
@@ -303,7 +311,8 @@ class Prior(SavedModule):
         """Independent plans `[num_plans, length]`; see `neuroprior.sampling.ancestral.sample`.
 
         After a `past` of executed actions, `[T]` or `[num_plans, T]`, plans go on from these, as a planner that replans
-        needs them.
+        needs them; with a `state`, what `start` or the last `step` returned, without reading the past again. A `mask`
+        says which actions may be drawn.
 
         `neuroprior.priors.decode(plans, prior)` gives their names.
 
@@ -316,6 +325,8 @@ class Prior(SavedModule):
             length,
             context,
             past=past,
+            state=state,
+            mask=mask,
             temperature=temperature,
             generator=generator,
             method=method,
@@ -349,6 +360,16 @@ class Prior(SavedModule):
                 f"`context` must be floating point features of size {self.context_size},"
                 f" got {str(context.dtype).removeprefix('torch.')} of shape {list(context.shape)}"
             )
+
+    def check_start(self, batch_size: int, context: Tensor | None) -> None:
+        """Raise ValueError unless `start` can be given this context; implementations of `start` begin with it."""
+        self.check_context_of(context, batch_size)
+
+    def check_step(self, action: Tensor, context: Tensor | None) -> None:
+        """Raise ValueError unless `step` can be given these; implementations of `step` begin with it."""
+        check_range("action", action, self.num_actions, "actions")
+        if context is not None:
+            self.check_context_of(context, len(action))
 
     def check_settings(self, settings: Mapping[str, Any]) -> None:
         """Raise ValueError unless `fit` takes all of these settings."""

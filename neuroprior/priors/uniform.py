@@ -28,12 +28,14 @@ class UniformPrior(Prior):
         super().__init__(num_actions)
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        self.check_start(batch_size, context)
         return torch.zeros(batch_size, self.num_actions, device=self.device), torch.empty(
             batch_size, 0, device=self.device
         )
 
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        return self.start(len(action))
+        self.check_step(action, context)
+        return self.start(len(action), context)
 
     def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Check `plans`, of which there is nothing to learn; returns self.
@@ -42,5 +44,5 @@ class UniformPrior(Prior):
             ValueError: plans of other actions, or any setting.
         """
         self.check_settings(settings)
-        training_plans(self, plans)
+        training_plans(self, self.as_plans(plans).without_context())
         return self

@@ -1,6 +1,7 @@
 """Sampling plans from any prior: one by one, by prefix tree, or together with a world."""
 
-from typing import Any, Literal
+from collections.abc import Callable
+from typing import Any, Literal, TypeAlias
 
 import torch
 from torch import Tensor
@@ -19,9 +20,12 @@ from neuroprior.sampling.draws import (
     worth_splitting,
 )
 from neuroprior.sampling.prefixes import Prefixes
-from neuroprior.sampling.states import State, numbers_in, select_rows
+from neuroprior.sampling.states import State, map_state, numbers_in, select_rows
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
-from neuroprior.worlds.world import Rollout, World, join_states
+from neuroprior.worlds.world import Rollout, World, join_states, step_alive
+
+Mask: TypeAlias = Callable[[Tensor], Any]
+"""Which actions may be drawn next, bool `[N, A]`, after the actions drawn so far, int64 `[N, t]`."""
 
 CACHED, FEWEST = 2**19, 1024
 """On a CPU, plans are stepped in parts of at most `CACHED` numbers in their states (or logits), so that they fit a
@@ -37,6 +41,8 @@ def sample(
     context: Tensor | None = None,
     *,
     past: Tensor | None = None,
+    state: tuple[Tensor, State] | None = None,
+    mask: Tensor | Mask | None = None,
     temperature: float = 1.0,
     generator: torch.Generator | None = None,
     method: Literal["auto", "ancestral", "tree"] = "auto",
@@ -58,9 +64,15 @@ def sample(
             step (`[N, L]`, `[N, L, C]`; after a past of T actions `[N, T + L, ...]`), where it is known beforehand.
         past: integers, the actions that were executed before, which the plans go on from: `[T]`, the same for all
             plans, or `[N, T]`. None: plans begin.
+        state: instead of a past, what the prior's `start` or its last `step` returned: logits and state, of one row,
+            which all plans go on from, or of N rows. So a planner that executes and replans steps its prior once for
+            each executed action. It is left as it is. A context, one per step, is then that of the steps to come.
+        mask: which actions may be drawn: bool `[A]`, `[L, A]` or `[N, L, A]`; or a function of the actions drawn,
+            int64 `[N, t]`, that returns bool `[N, A]`.
         temperature: divides the logits; below 1 sharper, above 1 flatter.
         generator: the source of randomness; the same seed gives the same plans.
-        method: see above. With a context per step, features, or pasts `[N, T]`, plans are always drawn plan by plan.
+        method: see above. With a mask, a context per step, features, pasts `[N, T]` or a state of N rows, plans are
+            always drawn plan by plan.
         batch_size: number of plans that are drawn together when drawing plan by plan; bounds memory.
 
     Returns:
@@ -68,7 +80,7 @@ def sample(
         follow the first one; `Plans(..., end=...).without_end()` cuts them off.
 
     Raises:
-        ValueError: an argument is out of range.
+        ValueError: an argument is out of range, or no action may be drawn.
 
     Example:
         >>> sample(UniformPrior(4), num_plans=3, length=5, generator=torch.Generator().manual_seed(0)).shape
@@ -90,22 +102,42 @@ def sample(
         raise ValueError(f'`method` must be "auto", "ancestral" or "tree", got {method!r}')
     if context is not None and context.shape[0] != num_plans:
         raise ValueError(f"context: its first dimension must be num_plans = {num_plans}, not {context.shape[0]}")
+    if state is not None and past is not None:
+        raise ValueError("`past` must be None with a state, which knows it, got both")
     past = _checked_past(past, num_plans, prior.num_actions).to(device)
     steps = past.shape[-1] + length
     if context is not None and not is_per_plan(context) and context.shape[1] < steps:
         what = "to be sampled" if steps == length else "in the past and to be sampled"
         raise ValueError(f"context: {steps} steps are {what}, but it has only {context.shape[1]}")
-    stepper.check_context(context, num_plans, steps)
+    if state is None or context is not None:
+        stepper.check_context(context, num_plans, steps)
     draw = Draw(prior.num_actions, temperature, generator_on(generator, device))
+    if num_plans == 0 or length == 0:
+        return torch.empty(num_plans, length, dtype=draw.dtype, device=device)
+    per_step = context if context is not None and not is_per_plan(context) else None
     with stepper.threads_for(num_plans):
-        if past.dim() == 2 or (context is not None and not (is_per_plan(context) and is_integer(context))):
-            one_each = torch.ones(num_plans, dtype=torch.long, device=device)
-            return _sample_from_roots(stepper, one_each, context, past, length, draw, "ancestral", batch_size)
-        if context is None:
-            roots = torch.full((min(num_plans, 1),), num_plans, device=device)
-            return _sample_from_roots(stepper, roots, None, past, length, draw, method, batch_size)
-        distinct, which, counts = context.unique(return_inverse=True, return_counts=True)
-        grouped = _sample_from_roots(stepper, counts, distinct, past, length, draw, method, batch_size)
+        which = None  # in which order plans are drawn, where it is not that of their contexts
+        if state is not None:
+            if context is not None and per_step is None:
+                raise ValueError("`context` must be one per step with a state, which knows the one before")
+            roots = _checked_state(state, num_plans, prior.num_actions)
+        elif past.dim() == 2 or (context is not None and not (is_per_plan(context) and is_integer(context))):
+            roots = _begin(stepper, num_plans, context, past, length)
+        elif context is None:
+            roots = _begin(stepper, 1, None, past, length)
+        else:
+            distinct, which, counts = context.unique(return_inverse=True, return_counts=True)
+            roots = _begin(stepper, len(distinct), distinct, past, length)
+        ahead = None if per_step is None else per_step[:, past.shape[-1] :]
+        if which is None:  # one root for all plans, or one for each
+            counts = torch.full((len(roots[0]),), num_plans if len(roots[0]) == 1 else 1, device=device)
+        if mask is not None:
+            row = torch.arange(len(counts), device=device).repeat_interleave(counts) if which is None else which
+            return _sample_masked(stepper, row, *roots, ahead, mask, length, draw)
+        method = "ancestral" if ahead is not None or (which is None and len(counts) > 1) else method
+        grouped = _sample_from_roots(stepper, counts, *roots, ahead, length, draw, method, batch_size)
+        if which is None:
+            return grouped
         plans = torch.empty_like(grouped)
         plans[which.argsort(stable=True)] = grouped
         return plans
@@ -186,7 +218,7 @@ def _sample_in_world(
         counts = children[row, action]
         root, hidden, now = _taken(row, root, hidden, now)
         begun = [_taken(row, *column) for column in begun]
-        now, reward = world.step(now, action, generator)
+        now, reward = step_alive(world, now, action, generator)
         for column, values in zip(begun, (action.to(draw.dtype), reward, now), strict=True):
             column.append(values)
         if not keep_states:
@@ -211,7 +243,7 @@ def _sample_in_world(
             parent, last = plans.extend(action)
             if parent is not None:
                 here, memory = _taken(parent, here, memory)
-            here, reward = world.step(here, last, generator)
+            here, reward = step_alive(world, here, last, generator)
             own[0].append(action.to(draw.dtype))
             own[1].append(plans.of_each(reward))
             if keep_states:
@@ -279,30 +311,97 @@ def _checked_past(past: Tensor | None, num_plans: int, num_actions: int) -> Tens
     return past.long()
 
 
+def _checked_state(state: tuple[Tensor, State], num_plans: int, num_actions: int) -> tuple[Tensor, State]:
+    """A copy of the logits and the state of one row or N, which may be overwritten.
+
+    Raises:
+        ValueError: it is none.
+    """
+    try:
+        logits, hidden = state
+        rows, columns = logits.shape
+    except (TypeError, ValueError, AttributeError):
+        raise ValueError("`state` must be what `start` or `step` returned, logits [N, A] and a state") from None
+    if columns != num_actions or rows not in (1, num_plans):
+        raise ValueError(
+            f"`state` must be of 1 row or of num_plans = {num_plans}, with {num_actions} logits each,"
+            f" got {[rows, columns]}"
+        )
+    return logits, map_state(torch.clone, hidden)
+
+
+def _begin(stepper: Stepper, num_roots: int, context: Tensor | None, past: Tensor, length: int) -> tuple[Tensor, State]:
+    """Logits and state of each root after its `past [T]` or `[roots, T]`, under its context; `length` steps follow."""
+    per_step = context is not None and not is_per_plan(context)
+    logits, state = stepper.start(num_roots, context[:, 0] if context is not None and per_step else context)
+    behind = past.shape[-1]
+    for t, action in enumerate(past.expand(num_roots, behind).unbind(1)):
+        given = context[:, t + 1] if context is not None and per_step and t + 1 < context.shape[1] else None
+        logits, state = stepper.step(action, state, given, behind - t - 1)
+    return logits, state
+
+
+def _sample_masked(
+    stepper: Stepper,
+    row: Tensor,
+    logits: Tensor,
+    state: State,
+    context: Tensor | None,
+    mask: Tensor | Mask,
+    length: int,
+    draw: Draw,
+) -> Tensor:
+    """Plans `[N, length]` of actions that a mask allows; plan i goes on from row `row[i]` of logits and state."""
+    plans = torch.empty(len(row), length, dtype=torch.long, device=row.device)
+    logits, state = logits[row], select_rows(state, row)
+    for t in range(length):
+        allowed = _allowed(mask, plans, t, draw.num_actions).to(logits.device)
+        plans[:, t] = draw.actions(logits.masked_fill(~allowed, -torch.inf))
+        if t + 1 < length:
+            given = None if context is None else context[:, t + 1]
+            logits, state = stepper.step(plans[:, t], state, given, length - t - 2)
+    return plans.to(draw.dtype)
+
+
+def _allowed(mask: Tensor | Mask, plans: Tensor, step: int, num_actions: int) -> Tensor:
+    """Which actions may be drawn next, bool `[A]` or `[N, A]`, in `plans [N, L]` of which `step` actions are drawn."""
+    num_plans, length = plans.shape
+    given = torch.as_tensor(mask(plans[:, :step]) if callable(mask) else mask)
+    shapes = [[num_actions], [length, num_actions], [num_plans, length, num_actions]]
+    if callable(mask):
+        shapes = [[num_plans, num_actions]]
+    if given.dtype != torch.bool or list(given.shape) not in shapes:
+        due = " or ".join(map(str, shapes))
+        raise ValueError(
+            f"`mask` must {'return' if callable(mask) else 'be'} bool {due}, got {given.dtype} {list(given.shape)}"
+        )
+    return given if callable(mask) or given.dim() == 1 else given[..., step, :]
+
+
 def _sample_from_roots(
     stepper: Stepper,
     counts: Tensor,
+    logits: Tensor,
+    state: State,
     context: Tensor | None,
-    past: Tensor,
     length: int,
     draw: Draw,
     method: str,
     batch_size: int,
 ) -> Tensor:
-    """`counts[r]` plans under `context[r]` for each root r: `[total, length]`, root by root, shuffled within.
+    """`counts[r]` plans from each root r: `[total, length]`, root by root, shuffled within.
 
-    `past [T]` or `[roots, T]` stands before all of them.
+    Args:
+        stepper: the prior.
+        counts: int64 `[roots]`.
+        logits, state: of the roots.
+        context: None, or that of each step to come; then each root has one plan.
+        length, draw, method, batch_size: see `sample`.
     """
     total = int(counts.sum())
     if total == 0 or length == 0:
         return torch.empty(total, length, dtype=draw.dtype, device=counts.device)
-    per_step = context is not None and not is_per_plan(context)
-    logits, state = stepper.start(len(counts), context[:, 0] if context is not None and per_step else context)
-    behind = past.shape[-1]
-    for t, action in enumerate(past.expand(len(counts), behind).unbind(1)):
-        given = context[:, t + 1] if context is not None and per_step else None
-        logits, state = stepper.step(action, state, given, behind - t - 1)
-    whole = stepper.draw_plans(state, counts, length, draw) if method == "auto" and not per_step else None
+    whole = stepper.draw_plans(state, counts, length, draw) if method == "auto" and context is None else None
     if whole is not None:
         return whole
     prefix = torch.empty(len(counts), 0, dtype=draw.dtype, device=counts.device)
@@ -328,8 +427,7 @@ def _sample_from_roots(
     plans[:, :depth] = begun
     for at in range(0, total, batch_size):
         some, here = row[at : at + batch_size], slice(at, at + batch_size)
-        given = context[:, behind:] if context is not None and per_step else None
-        plans[here, depth:] = _sample_one_by_one(stepper, some, logits, state, given, range(depth, length), draw)
+        plans[here, depth:] = _sample_one_by_one(stepper, some, logits, state, context, range(depth, length), draw)
     return plans
 
 

@@ -100,10 +100,7 @@ def check_possible(possible: Tensor) -> None:
     That is where the sums of the weights of all actions are positive; they are NaN where a logit is.
     """
     if not possible:
-        raise ValueError(
-            "prior: its logits are NaN or infinite, or -inf for all actions that are legal (of which there is at least"
-            " one in each state, see `World.legal_actions`)"
-        )
+        raise ValueError("prior: its logits are NaN or infinite, or -inf for all legal actions of a state")
 
 
 def are_few(total: int, device: torch.device) -> bool:

@@ -9,10 +9,9 @@ from torch import Tensor
 
 from neuroprior._checks import check_same_names, is_integer
 from neuroprior._threads import one_thread
-from neuroprior.plans.sequences import is_per_plan
 from neuroprior.sampling.draws import Draw, after_end, are_few
 from neuroprior.sampling.states import State
-from neuroprior.worlds.world import World, check_is_world
+from neuroprior.worlds.world import World, allowed_actions, check_is_world
 
 FEWEST_TO_SHARE = 256
 """The number of states from which the distinct ones are found, so that each is observed once."""
@@ -155,11 +154,7 @@ class Stepper:
             ValueError: the prior cannot act in the world, or its context is not what the world observes.
         """
         check_in_world(self._prior, world, state)
-        context = None if self.context_per is None else world.observe(state)
-        if context is not None and not is_per_plan(context) and getattr(self._prior, "num_patterns", None) is None:
-            raise ValueError(
-                f"`observe` must be indices [N] or features [N, C], got {context.dtype} {list(context.shape)}"
-            )
+        context = None if self.context_per is None else world.context(state)
         self.check_context(context, len(state))
         return self.start(len(state), context)
 
@@ -169,11 +164,11 @@ class Stepper:
         """As `step`, after `action` led to the world's states `reached [N, ...]`; each is observed once."""
         if self.context_per == "step" and self._advance_shared is not None and _numbered(reached):
             pair, row = (reached * self.num_actions + action).unique(return_inverse=True)
-            context, action = world.observe(pair // self.num_actions), pair % self.num_actions
+            context, action = world.context(pair // self.num_actions), pair % self.num_actions
             with self.threads_for(len(row)):
                 logits, state = self._advance_shared(action, state, context, row, room)
             return logits, state
-        return self.step(action, state, world.observe(reached) if self.context_per == "step" else None, room)
+        return self.step(action, state, world.context(reached) if self.context_per == "step" else None, room)
 
 
 def _numbered(reached: Tensor) -> bool:
@@ -209,5 +204,5 @@ def check_actions(prior: Steppable, world: World) -> None:
 
 
 def legal_logits(world: World, state: Tensor, logits: Tensor) -> Tensor:
-    """`logits [N, A]` with -inf for the actions that are not legal in `state [N, ...]`."""
-    return logits if world.all_legal else logits.masked_fill(~world.legal_actions(state), -torch.inf)
+    """`logits [N, A]` with -inf for the actions that no plan may take in `state [N, ...]`, see `allowed_actions`."""
+    return logits if world.all_legal else logits.masked_fill(~allowed_actions(world, state), -torch.inf)

@@ -88,7 +88,7 @@ def _check_decision(planner: Planner, world: TabularWorld, state: Tensor, decisi
         rewards.append(reward)
         states.append(now)
     row, trajectory = torch.arange(batch), torch.stack(states, 1)
-    prefixes = planner.prefix_scores(torch.stack(rewards, 1), trajectory)
+    prefixes = planner.for_world(world).prefix_scores(torch.stack(rewards, 1), trajectory)
     # The planner's own sums may be in another order.
     near = torch.isclose(decision.score.double(), prefixes[row, last - 1].double(), rtol=1e-4, atol=1e-5)
     require(bool(near.all()), "score: not that of the plan when it is executed")

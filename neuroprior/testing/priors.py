@@ -1,6 +1,7 @@
 """The conformance suite of priors."""
 
 import tempfile
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -11,7 +12,7 @@ from neuroprior.priors import Prior, load, save
 from neuroprior.sampling.ancestral import sample
 from neuroprior.sampling.states import select_rows
 from neuroprior.testing.chi_square import chi_square
-from neuroprior.testing.rules import FALSE_ALARM, PRIOR_CHECKS, check_by_kind, require
+from neuroprior.testing.rules import FALSE_ALARM, PRIOR_CHECKS, check_by_kind, raises, require
 
 
 def check_prior(prior: Any, length: int | None = None, num_plans: int = 20_000, seed: int = 0) -> None:
@@ -58,6 +59,7 @@ def check_prior(prior: Any, length: int | None = None, num_plans: int = 20_000, 
             _check_samples(prior, context, length, num_plans, method, generator)
         _check_seeds(prior, length, generator)
     _check_copies(prior, length, generator)
+    _check_refusals(prior, generator)
 
 
 def _random_context(
@@ -134,6 +136,27 @@ def _check_advancing(prior: Prior, plans: Tensor, context: Tensor | None, stays:
                 require(gap < 1e-4, f"advance differs from step by {gap:.2g} (action {t}, room {room})")
                 if t % 2:  # states that were picked out go on by themselves
                     other = select_rows(other, torch.arange(num, device=plans.device))
+
+
+@torch.no_grad()
+def _check_refusals(prior: Prior, generator: torch.Generator) -> None:
+    """Unknown actions and contexts are refused: `start` and `step` begin with `check_start` and `check_step`."""
+    context = _at(_random_context(prior, 3, 1, generator), 0)
+    _, state = prior.start(3, context)
+    for action in (-1, prior.num_actions):
+        wrong = torch.full((3,), action, device=prior.device)
+        told = raises(partial(prior.step, wrong, state))
+        require(told, f"step must raise ValueError for action {action}, see `Prior.check_step`")
+    wrong_context = None if prior.takes_context else torch.zeros(3, dtype=torch.long, device=prior.device)
+    what = "no context" if prior.takes_context else "a context, of which it takes none"
+    told = raises(partial(prior.start, 3, wrong_context))
+    require(told, f"start must raise ValueError for {what}, see `Prior.check_start`")
+    if prior.num_contexts is not None:
+        unknown = torch.full((3,), prior.num_contexts, device=prior.device)
+        require(raises(partial(prior.start, 3, unknown)), "start must raise ValueError for an unknown context")
+        right = torch.zeros(3, dtype=torch.long, device=prior.device)
+        told = raises(partial(prior.step, right, state, unknown))
+        require(told, "step must raise ValueError for an unknown context")
 
 
 def _has_rows(state: object, num: int) -> bool:

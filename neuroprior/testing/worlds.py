@@ -8,7 +8,6 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from neuroprior._checks import is_integer
 from neuroprior.testing.chi_square import alike
 from neuroprior.testing.rules import FALSE_ALARM, WORLD_CHECKS, check_by_kind, raises, require, same
 from neuroprior.worlds import SimulatorWorld, TabularWorld, World
@@ -202,47 +201,46 @@ def _check_step(world: Simulator, state: Tensor, action: Tensor, seed: int) -> N
 
 def _check_queries(world: Simulator, state: Tensor) -> None:
     """`observe` and `terminated`."""
-    if not isinstance(world, SimulatorWorld) or world.observation is not None:
+    if isinstance(world, World):
         _check_observation(world, state)
     ended = world.terminated(state)
     require(isinstance(ended, Tensor), f"terminated must return a tensor, not {type(ended).__name__}")
     require(ended.dtype == torch.bool and ended.shape == state.shape[:1], f"terminated must be bool [{len(state)}]")
-    _check_batch("terminated", world.terminated, state, ended)
+    check_batch("terminated", world.terminated, state, ended)
 
 
-def _check_observation(world: Simulator, state: Tensor) -> None:
-    """`observe`."""
-    observed = world.observe(state)
-    require(isinstance(observed, Tensor), f"observe must return a tensor, not {type(observed).__name__}")
-    fits = (is_integer(observed) and observed.dim() in (1, 2)) or (observed.is_floating_point() and observed.dim() == 2)
-    require(
-        len(observed) == len(state) and fits,
-        "observe must give indices [N] or [N, F] or floating point features [N, C],"
-        f" not {observed.dtype} {list(observed.shape)}",
-    )
+def _check_observation(world: World, state: Tensor) -> None:
+    """What is observed is declared, and is what was declared."""
+    if world.observation is None:
+        silent = raises(partial(world.observe, state))
+        require(silent, "observation: `observe` is written, but what it gives is not declared")
+        return
+    try:
+        observed = world.context(state)
+    except ValueError as error:
+        raise AssertionError(str(error)) from error
     require(not observed.isnan().any(), "observe: NaN in the observations")
-    _check_batch("observe", world.observe, state, observed)
+    check_batch("observe", world.context, state, observed)
 
 
 def _check_choices(world: World, state: Tensor) -> None:
     """`solved`, `legal_actions` and `group`."""
     solved = world.solved(state)
     require(solved.dtype == torch.bool and solved.shape == state.shape[:1], f"solved must be bool [{len(state)}]")
-    _check_batch("solved", world.solved, state, solved)
+    check_batch("solved", world.solved, state, solved)
     require(world.has_goal or not solved.any(), "solved: a goal is reached, but has_goal is False")
     legal = _legal_actions(world, state)
-    _check_batch("legal_actions", world.legal_actions, state, legal)
-    require(bool(legal.any(1).all()), "legal_actions: a state without any legal action")
+    check_batch("legal_actions", world.legal_actions, state, legal)
     if world.all_legal:
         require(bool(legal.all()), "all_legal is True, but legal_actions leaves some out")
     group = world.group(state)
     if group is not None:
         fits = isinstance(group, Tensor) and group.dtype == torch.int64 and group.shape == state.shape[:1]
         require(fits, f"group must return int64 [{len(state)}], or None")
-        _check_batch("group", lambda some: cast(Tensor, world.group(some)), state, group)
+        check_batch("group", lambda some: cast(Tensor, world.group(some)), state, group)
 
 
-def _check_batch(name: str, query: Callable[[Tensor], Tensor], state: Tensor, whole: Tensor) -> None:
+def check_batch(name: str, query: Callable[[Tensor], Tensor], state: Tensor, whole: Tensor) -> None:
     """What is found in a state, `whole` in all of them, does not depend on its batch, nor on its place there."""
     for some in (slice(len(state) // 2, None), slice(1, None), slice(0, 1)):
         alone = same(query(state[some]), whole[some])

@@ -6,7 +6,7 @@ from neuroprior.worlds.grid import GridWorld, egocentric, goal_direction, gridwo
 from neuroprior.worlds.gymnasium import from_gymnasium
 from neuroprior.worlds.labyrinth import labyrinth
 from neuroprior.worlds.mazes import four_rooms, maze
-from neuroprior.worlds.observations import Categories, Features
+from neuroprior.worlds.observations import Categories, Features, Patterns
 from neuroprior.worlds.simulators import SimulatorWorld, from_simulator
 from neuroprior.worlds.tabular import TabularWorld
 from neuroprior.worlds.world import Rollout, World
@@ -16,6 +16,7 @@ __all__ = [
     "EpisodicWorld",
     "Features",
     "GridWorld",
+    "Patterns",
     "PocketCube",
     "Rollout",
     "SimulatorWorld",

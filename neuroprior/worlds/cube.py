@@ -9,6 +9,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_count, check_range
 from neuroprior._random import generator_on
+from neuroprior.worlds.observations import Features
 from neuroprior.worlds.world import World
 
 FACES = ("U", "R", "F")
@@ -41,6 +42,8 @@ class PocketCube(World):
     """
 
     has_goal = True
+    objective = "terminal"
+    observation = Features(70)
 
     def __init__(
         self,

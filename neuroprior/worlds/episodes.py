@@ -8,11 +8,14 @@ from torch import Tensor
 
 from neuroprior._checks import check_count
 from neuroprior._random import generator_on
+from neuroprior.worlds.observations import Features
 from neuroprior.worlds.tabular import TabularWorld
 
 
 class EpisodicWorld(TabularWorld):
     """A `TabularWorld` with start states, absorbing terminal states, and any number of disjoint layouts.
+
+    Its objective is "return", as that of the environments it is made from.
 
     Args:
         next_state, reward, action_names, probability, legal_actions: see `TabularWorld`.
@@ -37,6 +40,8 @@ class EpisodicWorld(TabularWorld):
         >>> world.terminated(torch.tensor([0, 1])).tolist()
         [False, True]
     """
+
+    objective = "return"
 
     def __init__(
         self,
@@ -63,6 +68,8 @@ class EpisodicWorld(TabularWorld):
             raise ValueError("ended: every action must stay where an episode has ended")
         self.starts, self.ended, self.features = starts, ended, features
         self._locate = locate
+        if features is not None:
+            self.observation = Features(features.shape[1])
         self._layouts = torch.zeros_like(ended, dtype=torch.long) if layouts is None else layouts.long()
         self.num_layouts = int(self._layouts.max()) + 1
         self._goals = self._entered_with_reward()

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_count, check_memory, check_seed, check_sizes, is_number
 from neuroprior._random import generator_on
+from neuroprior.worlds.observations import Features
 from neuroprior.worlds.tabular import TabularWorld
 
 MOVES = ("up", "right", "down", "left")
@@ -74,6 +75,8 @@ class GridWorld(TabularWorld):
         super().__init__(table, reward[:1], action_names=TURNS if egocentric else MOVES)
         self._set_maps(reward)
         self._views = None if view is None else _view_table(walls, edges, view, egocentric)
+        if self._views is not None:
+            self.observation = Features(self._views.shape[1])
         # The cells in which planning may start; None where that is all of them.
         self._free = (
             (~walls.view(-1)).repeat_interleave(4 if egocentric else 1).nonzero()[:, 0] if walls.any() else None

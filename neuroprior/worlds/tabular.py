@@ -1,6 +1,7 @@
 """Worlds that are tables: a transition table and any number of reward maps over it, all evaluated in one call."""
 
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -8,6 +9,7 @@ from torch import Tensor
 from neuroprior._checks import check_count, check_range, is_integer
 from neuroprior._memory import new_empty
 from neuroprior._random import generator_on
+from neuroprior.worlds.observations import Categories
 from neuroprior.worlds.outcomes import Outcomes
 from neuroprior.worlds.world import Rollout, World, check_plans, join_states
 
@@ -21,6 +23,8 @@ class TabularWorld(World):
     Each action leads to one cell, or, with `probability`, to one of K random outcomes. `rollout` then uses common
     random numbers for all plans of a start, which makes their differences less noisy: one uniform number for each start
     and step draws the same quantile of the outcomes of each plan's action.
+
+    Its objective is "terminal", as in both simulations of the paper; `world.objective = "return"` changes it.
 
     Args:
         next_state: integers `[S, A]`: the cell that each action leads to. With `probability`, `[S, A, K]`: K outcomes.
@@ -51,6 +55,7 @@ class TabularWorld(World):
         ([0, 1], [0.0, 1.0])
     """
 
+    objective: Literal["terminal", "return"] = "terminal"
     num_layouts: int = 1
     compile_from: int = 2**20
 
@@ -77,6 +82,7 @@ class TabularWorld(World):
             None if legal_actions is None else _checked_legal(torch.as_tensor(legal_actions), self.next_state)
         )
         self.all_legal = self.legal_table is None
+        self.observation = Categories(self.num_states)
         if action_names is not None and len(action_names) != self.num_actions:
             raise ValueError(f"`action_names` must have {self.num_actions} names, got {len(action_names)}")
         self.action_names = None if action_names is None else tuple(action_names)

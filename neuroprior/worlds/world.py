@@ -1,12 +1,13 @@
 """The interface of a world: a batched simulator in which a planner tries its plans."""
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple, Self, TypeVar
+from typing import Literal, NamedTuple, Self, TypeVar
 
 import torch
 from torch import Tensor
 
 from neuroprior._checks import check_range, kind_of
+from neuroprior.worlds.observations import Observation, as_context
 
 
 class Rollout(NamedTuple):
@@ -55,10 +56,15 @@ class World(ABC):
 
     Attributes:
         num_actions: the number of actions, A.
-        all_legal: True where every action is legal in every state, so that `legal_actions` need not be called.
+        all_legal: True where every action is legal in every state, so that `legal_actions` need not be called. A class
+            that writes `legal_actions`, and says nothing of this, has False.
         stochastic: True where the outcome of an action is random, so that one rollout of a plan is not enough.
         shares_steps: True where steps from different states may be taken on several threads at once.
+        observation: what `observe` gives: `Categories(number)`, `Features(size)`, or None where nothing is observed.
         has_goal: True where `solved` says in which states a goal is reached.
+        objective: what counts in this world: "return", the sum of a plan's rewards, or "terminal", its last reward.
+            Planners without an objective of their own follow it.
+        discount: above 0, at most 1: the reward of step t (from 0) counts `discount ** t` in a return.
         action_names: names of the actions, where there are any.
     """
 
@@ -66,8 +72,16 @@ class World(ABC):
     all_legal: bool = True
     stochastic: bool = False
     shares_steps: bool = False
+    observation: Observation | None = None
     has_goal: bool = False
+    objective: Literal["terminal", "return"] = "return"
+    discount: float = 1.0
     action_names: tuple[str, ...] | None = None
+
+    def __init_subclass__(cls, **settings: object) -> None:
+        super().__init_subclass__(**settings)
+        if "legal_actions" in vars(cls) and "all_legal" not in vars(cls):
+            cls.all_legal = False
 
     def to(self, device: torch.device | str) -> Self:
         """Move the tensors of this world, and of worlds that it holds, to `device`; returns self."""
@@ -116,7 +130,7 @@ class World(ABC):
         now = state.repeat_interleave(num_plans, 0)
         rewards, states = [torch.zeros(batch, num_plans, 0, device=state.device)], []
         for t in range(length):
-            now, reward = self.step(now, plans[:, :, t].reshape(-1).long(), generator)
+            now, reward = step_alive(self, now, plans[:, :, t].reshape(-1).long(), generator)
             rewards.append(reward.view(batch, num_plans, 1))
             if keep_states:
                 states.append(now)
@@ -125,15 +139,36 @@ class World(ABC):
         return Rollout(now.view(shape), torch.cat(rewards, -1), kept)
 
     def observe(self, state: Tensor) -> Tensor:
-        """The observation in `state [N, ...]`: integers `[N]` (indices), integers `[N, F]` (several indices, as of
-        patterns), or floating point `[N, C]` (features).
+        """The observation in `state [N, ...]`, as `observation` declares it: `[N]` categories, `[N, C]` features.
 
-        Default: the state itself.
+        Default: there is none.
+
+        Raises:
+            ValueError: the world observes nothing.
         """
-        return state
+        raise ValueError(f"observe: {type(self).__name__} observes nothing; write `observe`, and declare `observation`")
+
+    def context(self, state: Tensor) -> Tensor:
+        """Returns what is observed in `state [N, ...]` as a context for priors: `[N]`, `[N, C]` or `[N, F]`.
+
+        Features that are integers or truth values become floating point.
+
+        Raises:
+            ValueError: nothing is declared in `observation`, or `observe` gives something else.
+        """
+        observed = self.observe(state)
+        if self.observation is None:
+            raise ValueError(
+                f"observation: {type(self).__name__} must declare what `observe` gives,"
+                " such as Categories(number) or Features(size)"
+            )
+        return as_context(self.observation, observed, len(state))
 
     def legal_actions(self, state: Tensor) -> Tensor:
-        """Which actions are legal in `state [N, ...]`: `[N, A]` bool, at least one in each row. Default: all."""
+        """Which actions are legal in `state [N, ...]`: `[N, A]` bool; where none is, the episode is over.
+
+        Default: all.
+        """
         return torch.ones(state.shape[0], self.num_actions, dtype=torch.bool, device=state.device)
 
     def terminated(self, state: Tensor) -> Tensor:
@@ -163,6 +198,31 @@ def join_states(states: list[Tensor], start: Tensor, shape: tuple[int, ...]) -> 
     if not states:
         return start.new_zeros(*shape[:2], 0, *shape[2:])
     return torch.stack([state.view(shape) for state in states], 2)
+
+
+def step_alive(
+    world: World, state: Tensor, action: Tensor, generator: torch.Generator | None = None
+) -> tuple[Tensor, Tensor]:
+    """As `world.step`, but a state `[N, ...]` in which no action is legal stays as it is, without reward."""
+    after, reward = world.step(state, action, generator)
+    if world.all_legal:
+        return after, reward
+    alive = world.legal_actions(state).any(1)
+    if alive.all():
+        return after, reward
+    return torch.where(alive.view(-1, *[1] * (state.dim() - 1)), after, state), reward * alive
+
+
+def allowed_actions(world: World, state: Tensor) -> Tensor:
+    """Which actions a plan may take in `state [N, ...]`, `[N, A]` bool: legal ones; any where the episode is over."""
+    legal = world.legal_actions(state)
+    return legal | ~legal.any(1, keepdim=True)
+
+
+def is_over(world: World, state: Tensor) -> Tensor:
+    """In which of `state [N, ...]` the episode is over, `[N]` bool: terminated, or no action is legal."""
+    over = world.terminated(state)
+    return over if world.all_legal else over | ~world.legal_actions(state).any(1)
 
 
 def check_is_world(world: object) -> None:

@@ -26,7 +26,8 @@ from neuroprior.agents import Agent, checkpoints, restore_agent, save_agent
 from neuroprior.planners import execute
 from neuroprior.priors import MixturePrior
 from neuroprior.puzzles import AStarPlanner
-from tests.support.sources import corridor, every_plan, refuses, seeded, stochastic_world
+from neuroprior.worlds import EpisodicWorld
+from tests.support.sources import every_plan, refuses, seeded, stochastic_world
 
 TRAINING = {"max_steps": 4, "progress": False}
 
@@ -97,7 +98,7 @@ class Line(World):
 
 def test_plans_that_end_by_themselves_are_executed_as_they_are():
     """Those of best-first searches: with a warm start as without, and from each start as from it alone."""
-    world = Line()
+    world = type("Left", (Line,), {"reset": lambda self, number, generator=None: torch.full((number,), 9)})()
 
     def run(starts, max_nodes, steps, **more):
         searcher = AStarPlanner(world.dip, max_nodes=max_nodes)
@@ -195,14 +196,13 @@ def test_all_is_kept_with_a_retention_of_1():
     assert [len(plans) for plans, _, _ in prior.fits] == [5, 10, 15]
 
 
-def test_steps_of_a_model_are_those_since_the_pause_too(tmp_path):
-    """What was executed before it and is not stored yet has its steps."""
+def test_what_is_not_stored_yet_outlasts_a_pause(tmp_path):
     whole = agent(learn_every=12)
     whole.run(4)
-    saved = [done.model_steps for done in whole.recent]
     again = restore_agent(agent(learn_every=12), save_agent(whole, tmp_path / "agent"))
-    assert [done.model_steps for done in again.recent] == saved
-    assert min(saved) > 0
+    assert len(again.recent) == len(whole.recent) > 0
+    for one, other in zip(again.recent, whole.recent, strict=True):
+        assert all(map(torch.equal, one, other))
 
 
 def test_it_learns_only_so_often(monkeypatch):
@@ -238,29 +238,46 @@ def test_it_stores_only_what_was_rewarded():
     assert torch.equal(one.replay.plans.actions.long(), plans[rewarded])
 
 
-def test_plans_end_where_the_world_terminates():
-    """Cell 3 of a corridor is the end of everything; an agent there executes nothing."""
-    table = corridor()
-    table.next_state[3] = 3
-    prior = UniformPrior(2)
-    state = torch.tensor([3, 2, 2, 1, 0])
-    one = Agent(
-        table,
-        SamplingPlanner(prior, 4, 64, value=lambda state: state.float()),
-        prior,
-        state,
-        replan_every=4,
-        learn_every=4,
-        plan_length=4,
-        retention=1.0,
-        generator=seeded(0),
+@pytest.mark.parametrize("replan_every", [1, 2, 3])
+@pytest.mark.parametrize("min_score", [None, 1.5])
+def test_an_agent_whose_episode_is_over_begins_anew(replan_every, min_score):
+    """Cell 3 of a corridor is an end that pays 2; plans are stored episode by episode, as counted by hand."""
+    next_state = torch.tensor([[0, 1], [0, 2], [1, 3], [3, 3]])
+    starts, ended = torch.tensor([0.3, 0.5, 0.2, 0.0]), torch.tensor([False, False, False, True])
+    reward = torch.tensor([[-0.5, 0.25], [-0.25, 0.5], [0.125, 2.0], [0.0, 0.0]])
+    world, prior = EpisodicWorld(next_state, reward[None], None, starts, ended), MarkovPrior(2, 0, num_contexts=4)
+    state = torch.tensor([2, 1, 0, 3, 1])
+    how = {"replan_every": replan_every, "learn_every": 12, "plan_length": 6, "retention": 1.0, "min_score": min_score}
+    planner = SamplingPlanner(UniformPrior(2), 4, 3)
+    one, begun, due = Agent(world, planner, prior, state, generator=seeded(0), **how), [], []
+    reset = world.reset
+    world.reset = lambda number, generator=None: begun.append(reset(number, generator)) or begun[-1]
+    done = one.run(6)
+    new = iter(torch.cat(begun).tolist())
+    now, stored = (
+        state.tolist(),
+        [[([], [], [])] for _ in state],
     )
-    done = one.run(4)
-    before = torch.cat([state[:, None], done.states[:, :-1]], 1)
-    due = (before != 3).sum(1).tolist()
-    assert due[0] == 0
-    assert one.replay.plans.lengths.tolist() == due[1:]
-    assert min(due[1:]) < 4
+    for t in range(6):
+        for b in range(5):
+            if t % replan_every == 0 and now[b] == 3:
+                now[b] = next(new)
+                stored[b].append(([], [], []))
+            action = int(done.actions[b, t])
+            if now[b] != 3:
+                for column, value in zip(stored[b][-1], (now[b], action, float(reward[now[b], action])), strict=True):
+                    column.append(value)
+            now[b] = int(next_state[now[b], action])
+            assert int(done.states[b, t]) == now[b]
+    assert next(new, None) is None
+    due = [part for parts in stored for part in parts if part[1] and (min_score is None or sum(part[2]) > min_score)]
+    plans = one.replay.plans
+    found = [
+        (plans.context[n, :length].tolist(), plans.actions[n, :length].tolist())
+        for n, length in enumerate(plans.lengths.tolist())
+    ]
+    assert found == [(context, actions) for context, actions, _ in due]
+    assert len(found) > (2 if min_score else 5)
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from neuroprior import MarkovPrior, MCTSPlanner, TabularWorld
+from neuroprior import MarkovPrior, MCTSPlanner, TabularWorld, UniformPrior
 from neuroprior.planners import FrontierPlanner, SamplingPlanner
 from tests.support.sources import FALSE_ALARM, p_value, seeded
 
@@ -86,3 +86,49 @@ def test_the_share_of_uniform_plans_is_rounded_to_the_nearest_number(share, numb
     assert len(found) == 2000 * number
     expected = 1000 * uniform
     assert abs(int(found.sum()) - expected) <= 5 * (expected / 2) ** 0.5
+
+
+def chain_world():
+    """Three actions on nine cells in a ring, with rewards that all differ."""
+    step = torch.tensor([1, 2, 5])
+    reward = torch.tensor([0.0, 1.0, -2.0, 4.0, 0.5, 7.0, -1.0, 3.0, 2.5])
+    return TabularWorld((torch.arange(9)[:, None] + step) % 9, reward[None])
+
+
+@pytest.mark.parametrize("objective", ["terminal", "return"])
+@pytest.mark.parametrize("any_prefix", [False, True])
+@pytest.mark.parametrize("kind", [SamplingPlanner, MCTSPlanner, FrontierPlanner])
+def test_all_candidates_are_kept_on_demand(kind, any_prefix, objective):
+    """Each with its own score, the best of which the decision has; and the same decision as without them."""
+    world, state = chain_world(), torch.tensor([0, 3, 7, 3])
+    planner = kind(UniformPrior(3), 3, 6, objective=objective, any_prefix=any_prefix)
+    assert planner.plan(world, state, seeded(0)).candidates is None
+    planner.steps_at_once = 40  # in chunks of a few starts
+    plain = planner.plan(world, state, seeded(0))
+    planner.keep_candidates = True
+    decision = planner.plan(world, state, seeded(0))
+    assert decision.plan.equal(plain.plan)
+    assert decision.score.equal(plain.score)
+    plans, scores = decision.candidates
+    rollout = world.rollout(state, plans, keep_states=True)
+    due = planner.prefix_scores(rollout.rewards, rollout.states)
+    due = due.amax(2) if any_prefix and kind is not FrontierPlanner else due[..., -1]
+    there = scores > -torch.inf
+    assert there.any(1).all()
+    torch.testing.assert_close(scores[there], due[there])
+    best = scores.amax(1)
+    assert (
+        (best <= decision.score + 1e-6).all() if any_prefix and kind is FrontierPlanner else best.equal(decision.score)
+    )
+    visits, values = decision.candidates.visits(3), decision.candidates.values(3)
+    for b in range(4):
+        for action in range(3):
+            mine = scores[b][there[b] & (plans[b, :, 0] == action)]
+            assert int(visits[b, action]) == len(mine)
+            assert mine.mean().isclose(values[b, action], equal_nan=True)
+
+
+def test_a_decision_says_what_it_is_in_a_line():
+    decision = SamplingPlanner(UniformPrior(3), 4, 16).plan(chain_world(), torch.tensor([1, 2]), seeded(0))
+    mean = float(decision.score.mean())
+    assert repr(decision) == f"Decision(2 plans of 4 actions, mean score {mean:.4g}, 64 model steps each)"

@@ -45,11 +45,11 @@ class Counted(TabularWorld):
 def score_of(planner, world, state, decision):
     """What the plans of a decision score when they are tried, prefix by prefix."""
     rollout = world.rollout(state, decision.plan[:, None].long(), keep_states=True)
-    scores = planner.prefix_scores(rollout.rewards, rollout.states)[:, 0]
+    scores = planner.for_world(world).prefix_scores(rollout.rewards, rollout.states)[:, 0]
     last = scores.shape[1] - 1 if decision.lengths is None else decision.lengths - 1
     row = torch.arange(len(scores))
     if not planner.any_prefix:
-        return planner.score(rollout.rewards, rollout.final_state)[:, 0], rollout.final_state[:, 0]
+        return planner.for_world(world).score(rollout.rewards, rollout.final_state)[:, 0], rollout.final_state[:, 0]
     return scores[row, last], rollout.states[row, 0, last]
 
 

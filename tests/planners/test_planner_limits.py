@@ -72,9 +72,20 @@ class DeadEnd(Walk):
 
 
 @PLANNERS
-def test_a_start_without_any_legal_plan_is_refused(make):
-    with pytest.raises(ValueError, match="legal"):
-        make().plan(DeadEnd(torch.float), torch.tensor([[0.0, 0.0], [3.0, 0.0]]))
+def test_a_state_without_any_legal_action_is_an_end(make):
+    """The reward is 1 in each step that ends right of 0; from (3, 0) there is none to take, and nothing to gain."""
+    world, start = DeadEnd(torch.float), torch.tensor([[0.0, 0.0], [3.0, 0.0], [1.5, 1.0]])
+    decision = make(objective="return").plan(world, start, torch.Generator().manual_seed(0))
+    states, total = start, torch.zeros(3)
+    for action in decision.plan.T:
+        alive = states[:, 0] < 2
+        after, reward = world.step(states, action.long())
+        states, total = torch.where(alive[:, None], after, states), total + reward * alive
+    assert decision.score.equal(total)
+    assert decision.final_state.equal(states)
+    assert decision.score[1] == 0
+    assert decision.final_state[1].equal(start[1])
+    assert decision.score[2] > 0
 
 
 @pytest.mark.parametrize(
@@ -101,7 +112,8 @@ def test_a_plan_may_be_shorter_where_the_episode_ends_with_it():
     for every in (1, 2, 3):
         assert world.solved(execute(planner, world, state, 6, replan_every=every).states[:, -1]).all()
         agent = Agent(world, planner, prior, state, replan_every=every, plan_length=6, learn_every=None)
-        assert world.solved(agent.run(6).states[:, -1]).all()
+        solved = world.solved(agent.run(6).states.flatten(0, 1)).view(40, 6)
+        assert solved.any(1)[lengths > 0].all()
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from neuroprior import (
     gridworld,
     oracle,
 )
+from neuroprior.worlds import Features
 from tests.support.sources import (
     FALSE_ALARM,
     best_plan_distribution,
@@ -100,7 +101,7 @@ def test_sampling_decides_for_the_best_of_its_candidates(world, goal, prior):
     assert decision.model_steps == 20
     assert plans.shape == (len(states), 5, 4)
     again = world.rollout(states, plans)
-    assert torch.equal(planner.score(again.rewards, again.final_state), score)
+    assert torch.equal(planner.for_world(world).score(again.rewards, again.final_state), score)
     assert torch.equal(again.final_state, ends)
     for i in range(len(states)):
         found = [brute_force(world, i, plan, goal) for plan in plans[i]]
@@ -235,7 +236,10 @@ def test_collect_from_random_starts_has_the_closed_form_on_a_torus():
 class Walk(World):
     """A world with states of two numbers, without a table; the reward is minus the distance from (2, 0)."""
 
-    num_actions = 4
+    num_actions, objective, observation = 4, "terminal", Features(2)
+
+    def observe(self, state):
+        return state
 
     def reset(self, batch_size, generator=None):
         return torch.zeros(batch_size, 2)
@@ -266,7 +270,8 @@ def test_states_of_more_than_one_number(planner):
         (lambda: ExhaustivePlanner(2, objective="mean"), "objective"),
         (lambda: ExhaustivePlanner(2, objective="return", discount=0), "discount"),
         (lambda: ExhaustivePlanner(2, objective="return", discount=1.1), "discount"),
-        (lambda: ExhaustivePlanner(2, discount=0.9), "discount"),
+        (lambda: ExhaustivePlanner(2, objective="terminal", discount=0.9), "discount"),
+        (lambda: ExhaustivePlanner(2, discount=0.9).plan(random_world(0), torch.tensor([0])), "discount"),
         (lambda: ExhaustivePlanner(2).plan(random_world(0), torch.tensor([12])), "12"),
         (lambda: SamplingPlanner(UniformPrior(3), 0, 2), "length"),
         (lambda: SamplingPlanner(UniformPrior(3), 2, 0), "num_plans"),

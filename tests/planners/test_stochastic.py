@@ -89,7 +89,7 @@ def test_in_a_deterministic_world_the_expected_score_is_the_score(kind, goal):
     states = world.reset(20, seeded(0))
     plans = torch.randint(3, (20, 6, 4), generator=seeded(1))
     rollout = world.rollout(states, plans)
-    want = ExhaustivePlanner(1, **goal).score(rollout.rewards, rollout.final_state)
+    want = ExhaustivePlanner(1, **goal).for_world(world).score(rollout.rewards, rollout.final_state)
     torch.testing.assert_close(expected_score(world, states, plans, **goal), want)
 
 

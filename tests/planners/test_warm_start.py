@@ -64,7 +64,9 @@ def test_a_decision_never_gets_worse(any_prefix, objective):
     rollout = world.rollout(state, chosen.plan[:, None].long(), keep_states=True)
     last = torch.full((300,), 4) if chosen.lengths is None else chosen.lengths - 1
     row = torch.arange(300)
-    assert torch.allclose(planner.prefix_scores(rollout.rewards, rollout.states)[row, 0, last], chosen.score)
+    assert torch.allclose(
+        planner.for_world(world).prefix_scores(rollout.rewards, rollout.states)[row, 0, last], chosen.score
+    )
     assert torch.equal(rollout.states[row, 0, last], chosen.final_state)
     assert (chosen.lengths is None) == (not any_prefix)
 

@@ -22,7 +22,7 @@ from neuroprior.puzzles import (
     sokoban,
 )
 from neuroprior.puzzles.bootstrap import read_solutions, solution_plans, solution_steps, with_symmetries
-from neuroprior.worlds import cube
+from neuroprior.worlds import Categories, cube
 from tests.puzzles.worlds.test_sokoban import LEVELS
 from tests.support.sources import seeded
 
@@ -123,7 +123,10 @@ def test_other_validation_plans_are_another_call(tmp_path: Path) -> None:
 class Line(World):
     """A walk on a line to a place; all such worlds have the same states."""
 
-    num_actions, has_goal = 2, True
+    num_actions, has_goal, observation = 2, True, Categories(21)
+
+    def observe(self, state: Tensor) -> Tensor:
+        return state
 
     def __init__(self, goal: int) -> None:
         self.goal = goal

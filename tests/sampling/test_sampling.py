@@ -9,6 +9,7 @@ from neuroprior import GRUPrior, MarkovPrior, Plans, TabularWorld, TransformerPr
 from neuroprior.control import NoisePrior
 from neuroprior.sampling import ancestral, draws, sample_in_world, stepping
 from neuroprior.sampling.draws import Draw
+from neuroprior.worlds import Features
 from tests.support.sources import (
     FALSE_ALARM,
     TablePrior,
@@ -435,7 +436,10 @@ def test_steps_of_a_stochastic_world_are_drawn_by_the_generator():
 class Line(World):
     """States are points on a line, `[N, 1]` floating point, observed as features."""
 
-    num_actions = 2
+    num_actions, observation = 2, Features(1)
+
+    def observe(self, state):
+        return state
 
     def reset(self, batch_size, generator=None):
         return torch.zeros(batch_size, 1)

@@ -27,7 +27,7 @@ from neuroprior.behaviour import SemiMarkovPrior
 from neuroprior.puzzles import LogLinearPrior, sliding_tiles, sokoban
 from neuroprior.testing import check_prior, check_world
 from neuroprior.testing.chi_square import alike, chi_square
-from neuroprior.worlds import Rollout, cube, egocentric, four_rooms, maze
+from neuroprior.worlds import Features, Rollout, cube, egocentric, four_rooms, maze
 from tests.support.sources import stochastic_world
 
 SOKOBAN = ["#######\n#@ $ .#\n#######", "######\n#.$  #\n# +$ #\n#    #\n######"]
@@ -255,7 +255,7 @@ def test_what_is_no_prior_fails_with_a_message(given: object, message: str) -> N
 class Line(World):
     """A right world without a table: a point on a line, to be broken in one place."""
 
-    num_actions = 2
+    num_actions, observation = 2, Features(1)
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         return torch.rand(batch_size, 1, generator=generator)
@@ -263,6 +263,17 @@ class Line(World):
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         after = state + (2.0 * action[:, None] - 1)
         return after, -after[:, 0].abs()
+
+    def observe(self, state: Tensor) -> Tensor:
+        return state
+
+
+class Undeclared(Line):
+    observation = None
+
+
+class Miscounted(Line):
+    observation = Features(3)
 
 
 class Noisy(Line):
@@ -345,13 +356,6 @@ class Biased(Lucky):
         return Rollout(final, torch.where(pick[..., None], better.rewards, worse.rewards))
 
 
-class Stuck(Line):
-    all_legal = False
-
-    def legal_actions(self, state: Tensor) -> Tensor:
-        return torch.zeros(len(state), 2, dtype=torch.bool)
-
-
 class Ending(Line):
     """Over beyond 2: a right world, where nothing happens after the end."""
 
@@ -392,6 +396,8 @@ class KeepsStarts(Line):
 
 
 class Unsaid(Line):
+    all_legal = True
+
     def legal_actions(self, state: Tensor) -> Tensor:
         return torch.tensor([True, False]).expand(len(state), 2)
 
@@ -468,8 +474,9 @@ def test_worlds_of_ones_own_conform(world: type[World]) -> None:
         (Calm, "rewards of rollout do not fit"),
         (Lucky, "different random numbers"),
         (Biased, "do not fit those of steps"),
-        (Stuck, "without any legal action"),
         (Unsaid, "all_legal is True"),
+        (Undeclared, "what it gives is not declared"),
+        (Miscounted, r"`observe` must give .*Features\(size=3\), got torch.float32 \[\d+, 1\]"),
         (GoesOn, "terminated states must stay"),
         (PaysOn, "reward from terminated states must be 0"),
         (Unmarked, "has_goal is False"),

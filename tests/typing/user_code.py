@@ -24,6 +24,7 @@ from neuroprior import (
     TabularWorld,
     World,
     collect,
+    compare,
     fit,
     gridworld,
     load,
@@ -32,6 +33,7 @@ from neuroprior import (
     write_plans,
 )
 from neuroprior.behaviour import DurationModel, mean_interval
+from neuroprior.comparison import Comparison
 from neuroprior.control import DoubleIntegrator, ICEMPlanner, NoisePrior, VectorDecision, VectorPlans, VectorPrior
 from neuroprior.planners import Decision, Execution, execute
 from neuroprior.priors.learning import training_plans
@@ -123,6 +125,10 @@ def planning(prior: Prior) -> None:
     assert_type(decision.score, Tensor)
     assert_type(decision.model_steps, int)
     assert_type(execute(SamplingPlanner(learned, 3, 4), world, starts, 2), Execution)
+    own: dict[str, Any] = {"length": 3, "starts": 4, "training_starts": 20, "seeds": 1, "progress": False}
+    comparison = compare(world, {"mine": learned, "gru": partial(MarkovPrior, order=2)}, [SamplingPlanner], [4], **own)
+    assert_type(comparison, Comparison)
+    assert_type(comparison.rows[0].score, float)
     assert_type(Cart().rollout(Cart().reset(1), torch.zeros(1, 1, 2, dtype=torch.long)), Rollout)
     assert prior.num_actions == 3
 

@@ -8,7 +8,7 @@ from math import inf, log, log2
 import torch
 from torch import Tensor
 
-from neuroprior.behaviour.analysis.statistics import ENOUGH_UNITS, ROUNDING, Difference, ratio_difference
+from neuroprior._statistics import ENOUGH_UNITS, ROUNDING, Difference, ratio_difference
 from neuroprior.plans import Plans
 from neuroprior.plans.columns import never_occur
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
@@ -16,6 +16,7 @@ from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors import ContextTreePrior, Prior, UniformPrior
 from neuroprior.priors.counts import Chains, TooLargeError
 from neuroprior.priors.ensembles.candidates import DEPTH, ORDERS
+from neuroprior.priors.learning import plans_for
 
 
 @dataclass(frozen=True)
@@ -229,7 +230,7 @@ def baselines(
     """
     contexts: list[int | None] = [num_contexts] if num_contexts is None or always_context else [None, num_contexts]
     if num_contexts is None or not always_context:
-        yield _best("uniform", [("", UniformPrior(training.num_actions).fit(training))], validation)
+        yield _best("uniform", [("", UniformPrior(training.num_actions).fit(training.without_context()))], validation)
     for order in ORDERS:
         if progress is not None:
             progress(f"markov-{order}")
@@ -237,7 +238,7 @@ def baselines(
     if progress is not None:
         progress("context tree")
     trees = (ContextTreePrior(training.num_actions, DEPTH, num_contexts=num) for num in contexts)
-    yield _best("context tree", ((f"depth {DEPTH}", tree.fit(training)) for tree in trees), validation)
+    yield _best("context tree", ((f"depth {DEPTH}", tree.fit(plans_for(tree, training))) for tree in trees), validation)
 
 
 def _chains(training: Plans, order: int, contexts: list[int | None], validation: Plans) -> Iterator[tuple[str, Prior]]:

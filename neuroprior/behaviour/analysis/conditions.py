@@ -13,10 +13,10 @@ from scipy.special import stdtrit
 from torch import Tensor
 
 from neuroprior._checks import check_sizes
+from neuroprior._statistics import ENOUGH_UNITS, Difference, holm, ratio_difference
 from neuroprior.behaviour.analysis.condition_chains import SMOOTHING, ConditionChains
 from neuroprior.behaviour.analysis.flat import FlatPlans, ranks
 from neuroprior.behaviour.analysis.permutation_design import PermutationDesign
-from neuroprior.behaviour.analysis.statistics import ENOUGH_UNITS, Difference, holm, ratio_difference
 from neuroprior.plans import Plans
 from neuroprior.plans.plans import check_are_plans
 

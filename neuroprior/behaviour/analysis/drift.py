@@ -15,8 +15,8 @@ from scipy import special, stats
 from torch import Tensor
 
 from neuroprior._checks import check_sizes
+from neuroprior._statistics import Difference, Interval, holm, ratio_difference
 from neuroprior.behaviour.analysis.comparison import units
-from neuroprior.behaviour.analysis.statistics import Difference, Interval, holm, ratio_difference
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
 from neuroprior.plans.plans import check_are_plans

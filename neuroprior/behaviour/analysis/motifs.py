@@ -12,9 +12,9 @@ from scipy.special import stdtrit, xlogy
 from torch import Tensor
 
 from neuroprior._checks import as_list, check_sizes
+from neuroprior._statistics import holm
 from neuroprior.behaviour.analysis.comparison import units
 from neuroprior.behaviour.analysis.flat import FlatPlans, ranks
-from neuroprior.behaviour.analysis.statistics import holm
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
 

@@ -14,7 +14,7 @@ from neuroprior.behaviour.durations.laws import LAW_NAMES, LawName
 from neuroprior.plans import Plans
 from neuroprior.priors.construction import as_prior, construct, described
 from neuroprior.priors.counts import MarkovPrior
-from neuroprior.priors.learning import counted_plans, training_plans
+from neuroprior.priors.learning import counted_plans, plans_for, training_plans
 from neuroprior.priors.prior import Prior
 
 
@@ -115,7 +115,7 @@ class SemiMarkovPrior(Prior):
         self.check_settings(settings)
         plans = training_plans(self, plans)
         self.durations.fit(plans)
-        self.actions.fit(plans, generator=generator, **settings)
+        self.actions.fit(plans_for(self.actions, plans), generator=generator, **settings)
         return self
 
     def recount(self, plans: Plans) -> Self:

@@ -9,8 +9,8 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from neuroprior._statistics import ENOUGH_UNITS, ratio_difference
 from neuroprior.behaviour.analysis.comparison import Score, score_bits, unit_name
-from neuroprior.behaviour.analysis.statistics import ENOUGH_UNITS, ratio_difference
 from neuroprior.behaviour.durations.duration_model import DurationModel
 from neuroprior.behaviour.durations.laws import resolution
 from neuroprior.behaviour.report import figures

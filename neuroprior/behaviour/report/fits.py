@@ -21,6 +21,7 @@ from neuroprior.priors.counts import TooLargeError
 from neuroprior.priors.ensembles import candidates
 from neuroprior.priors.ensembles.candidates import Effort, fitted_experts, number_tried
 from neuroprior.priors.ensembles.mixture import divided
+from neuroprior.priors.learning import plans_for
 
 Arrays = dict[str, np.ndarray[Any, Any]]
 
@@ -148,7 +149,7 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: Design, seed: int)
         for baseline in baselines(training, validation, sizes.get("num_contexts"), always_context=True):
             if baseline.prior is not None:
                 # Chosen on the validation plans; then these are learned from as well.
-                yield baseline.model, baseline.how, baseline.prior.fit(learned)
+                yield baseline.model, baseline.how, baseline.prior.fit(plans_for(baseline.prior, learned))
     elif kind == COMBINED:
         training, validation = divided(learned, None, generator)
         experts = list(fitted_experts(training, validation, sizes, design.effort, generator, design.training))
@@ -162,7 +163,7 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: Design, seed: int)
         yield kind, combined.summary(), combined
     else:
         prior: Any = construct(NETWORKS[kind], learned.num_actions, sizes | {"seed": seed})
-        yield kind, "", prior.fit(learned, generator=generator, **design.training)
+        yield kind, "", prior.fit(plans_for(prior, learned), generator=generator, **design.training)
 
 
 def _by_lag(kind: str, learned: Plans, scored: Plans, design: Design, seed: int) -> Arrays:

@@ -8,11 +8,11 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from neuroprior._statistics import ENOUGH_UNITS
 from neuroprior.behaviour.analysis.comparison import never_taken, too_few, unit_name, units
 from neuroprior.behaviour.analysis.drift import action_drift, by_group, by_plan, by_position
 from neuroprior.behaviour.analysis.lags import mutual_information
 from neuroprior.behaviour.analysis.motifs import motifs
-from neuroprior.behaviour.analysis.statistics import ENOUGH_UNITS
 from neuroprior.behaviour.analysis.transitions import transitions
 from neuroprior.behaviour.report import figures
 from neuroprior.behaviour.report.conditions import condition_section

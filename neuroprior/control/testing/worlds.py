@@ -8,7 +8,7 @@ from torch import Tensor
 from neuroprior.control.vector_plans import VectorPlans
 from neuroprior.control.worlds.continuous_world import ContinuousWorld
 from neuroprior.testing.rules import raises, require
-from neuroprior.testing.worlds import check_dynamics, check_reset
+from neuroprior.testing.worlds import check_batch, check_dynamics, check_reset
 
 
 def check_continuous_world(
@@ -42,8 +42,13 @@ def check_continuous_world(
 
 
 def _check_features(world: ContinuousWorld, state: Tensor) -> None:
+    """`observe`: floating point features of each state."""
     observed = world.observe(state)
-    require(observed.is_floating_point(), f"observe must give floating point features, not {observed.dtype}")
+    require(isinstance(observed, torch.Tensor), f"observe must return a tensor, not {type(observed).__name__}")
+    fits = observed.is_floating_point() and observed.dim() == 2 and len(observed) == len(state)
+    require(fits, f"observe must give floating point features [N, C], not {observed.dtype} {list(observed.shape)}")
+    require(not observed.isnan().any(), "observe: NaN in the observations")
+    check_batch("observe", world.observe, state, observed)
 
 
 def _plans(

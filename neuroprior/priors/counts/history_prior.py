@@ -64,10 +64,12 @@ class HistoryPrior(Prior):
         self.learn(Tree.empty(num_actions, self.device), Counts.empty(self.device))
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        self.check_start(batch_size, context)
         node = self.start_node.expand(batch_size)
         return self._at(node, torch.zeros_like(node) if context is None else context.long())
 
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        self.check_step(action, context)
         contexts = self.num_contexts or 1
         node = self.next_node.view(-1)[state.div(contexts, rounding_mode="floor") * self.num_actions + action].long()
         return self._at(node, state % contexts if context is None else context.long())

@@ -11,7 +11,7 @@ from neuroprior._checks import check_count, is_number
 from neuroprior.plans import Plans
 from neuroprior.priors.counts.histories import Counts, Tree, level_bounds, parent_rows, row_blocks
 from neuroprior.priors.counts.history_prior import HistoryPrior
-from neuroprior.priors.learning import training_plans
+from neuroprior.priors.learning import plans_for, training_plans
 
 Backoff = Literal["dirichlet", "witten-bell", "kneser-ney"]
 
@@ -215,9 +215,10 @@ class Chains:
     """
 
     def __init__(self, plans: Plans, order: int, num_contexts: int | None = None) -> None:
-        self.plans, self.order, self.num_contexts = plans, order, num_contexts
+        self.order, self.num_contexts = order, num_contexts
         self._first = MarkovPrior(plans.num_actions, order, num_contexts=num_contexts)
-        self._counted = self._first.count(plans)
+        self.plans = plans_for(self._first, plans)
+        self._counted = self._first.count(self.plans)
         self._first.hold(*self._counted, torch.empty(0, plans.num_actions))
 
     def log_likelihood(self, plans: Plans) -> Tensor:

@@ -12,6 +12,7 @@ from neuroprior.plans.plans import Plans
 from neuroprior.priors.construction import construct
 from neuroprior.priors.counts import BACKOFFS_TRIED, Chains, ContextTreePrior, MarkovPrior, TooLargeError
 from neuroprior.priors.ensembles.stacked import StackedPrior
+from neuroprior.priors.learning import plans_for
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.uniform import UniformPrior
@@ -71,7 +72,7 @@ def fitted_experts(
     """
     yield from counted(learned, held_out, contexts)
     for prior in networks(learned.num_actions, contexts, effort, draw_seed(generator) % 2**31):
-        yield prior.fit(learned, generator=generator, **{"validation": held_out, **settings})
+        yield prior.fit(plans_for(prior, learned), generator=generator, **{"validation": held_out, **settings})
 
 
 def number_tried(experts: Iterable[Prior]) -> int:
@@ -94,13 +95,14 @@ def counted(learned: Plans, held_out: Plans, contexts: dict[str, int]) -> Iterat
         contexts: `num_contexts`, for priors that take an index and as many that do not; features cannot be counted.
     """
     num_contexts, parts = contexts.get("num_contexts"), counting_parts(learned, held_out)
-    yield UniformPrior(learned.num_actions).fit(learned)
+    yield UniformPrior(learned.num_actions).fit(learned.without_context())
     for number in [None] if num_contexts is None else [None, num_contexts]:
         found = best_chain(parts, number)
         if found is not None:
             yield found
         try:
-            yield ContextTreePrior(learned.num_actions, DEPTH, num_contexts=number).fit(learned)
+            tree = ContextTreePrior(learned.num_actions, DEPTH, num_contexts=number)
+            yield tree.fit(plans_for(tree, learned))
         except TooLargeError:
             continue
 

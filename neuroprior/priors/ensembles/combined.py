@@ -24,7 +24,7 @@ from neuroprior.priors.ensembles.mixture import (
     weights_before,
 )
 from neuroprior.priors.ensembles.stacked import context_for
-from neuroprior.priors.learning import counted_plans, known_plans, training_plans
+from neuroprior.priors.learning import counted_plans, known_plans, plans_for, training_plans
 from neuroprior.priors.neural.neural import training_settings
 from neuroprior.priors.prior import Prior, taken_of
 from neuroprior.priors.uniform import UniformPrior
@@ -181,10 +181,12 @@ class CombinedPrior(MixturePrior):
         self._allocate()
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, State]:
+        self.check_start(batch_size, context)
         found = [e.start(batch_size, context_for(e, context)) for e in self._experts()]
         return self._mixed_now(self.first.expand(batch_size, -1), self.tracking.expand(batch_size, -1), found)
 
     def step(self, action: Tensor, state: Any, context: Tensor | None = None) -> tuple[Tensor, State]:
+        self.check_step(action, context)
         weights, tracking, forecasts, *states = state
         found = [e.step(action, s, context_for(e, context)) for e, s in zip(self._experts(), states, strict=True)]
         taken = taken_of(forecasts, action)
@@ -293,7 +295,7 @@ class CombinedPrior(MixturePrior):
         plans, counted = counted_plans(self, plans), []
         for e in priors_in(self.spare):
             try:
-                counted.append(e.recount(plans))
+                counted.append(e.recount(plans_for(e, plans)))
             except TooLargeError:  # it fitted before only just
                 continue
         self.spare = nn.ModuleList(counted)
@@ -352,7 +354,7 @@ def chosen_on(
         return held_out.of(kept), kept, powers
     found = [(forecasts[:, :, counting], plans.actions, held_out.mask)]
     for rest, left_out in parts[1:]:
-        counted = [deepcopy(experts[number]).fit(rest) for number in counting]
+        counted = [deepcopy(experts[number]).fit(plans_for(experts[number], rest)) for number in counting]
         found.append((_forecasts(counted, left_out), left_out.actions, left_out.mask()))
     every, actions, mask = map(_joined, zip(*found, strict=True))
     known = HeldOut(every, actions, mask, tried)

@@ -12,7 +12,7 @@ from neuroprior.plans import Plans
 from neuroprior.plans.folds import check_alike, fair_split, ungrouped
 from neuroprior.priors.construction import as_prior, described
 from neuroprior.priors.ensembles.stacked import context_for
-from neuroprior.priors.learning import counted_plans, known_plans, training_plans, validation_plans
+from neuroprior.priors.learning import counted_plans, known_plans, plans_for, training_plans, validation_plans
 from neuroprior.priors.prior import Prior, taken_of
 from neuroprior.sampling.states import State
 
@@ -119,11 +119,13 @@ class MixturePrior(Prior):
             expert.restore(own)
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, State]:
+        self.check_start(batch_size, context)
         found = [e.start(batch_size, context_for(e, context)) for e in self._experts()]
         weights = self.first.expand(batch_size, -1)
         return self._mixed(weights, found)
 
     def step(self, action: Tensor, state: Any, context: Tensor | None = None) -> tuple[Tensor, State]:
+        self.check_step(action, context)
         weights, forecasts, *states = state
         found = [e.step(action, s, context_for(e, context)) for e, s in zip(self._experts(), states, strict=True)]
         return self._mixed(after(weights, taken_of(forecasts, action), self.first, self.share), found)
@@ -173,12 +175,12 @@ class MixturePrior(Prior):
         for expert in self._experts():
             known = {"validation": held_out, **settings}
             known = {name: value for name, value in known.items() if name in expert.fit_settings}
-            expert.fit(learned, generator=generator, **known)
+            expert.fit(plans_for(expert, learned), generator=generator, **known)
 
     def recount(self, plans: Plans) -> Self:
         plans = counted_plans(self, plans)
         for expert in self._experts():
-            expert.recount(plans)
+            expert.recount(plans_for(expert, plans))
         return self
 
     @torch.no_grad()

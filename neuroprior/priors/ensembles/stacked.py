@@ -12,7 +12,7 @@ from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, in_parts, num_units
 from neuroprior.priors.counts import ContextTreePrior, HistoryPrior, MarkovPrior
-from neuroprior.priors.learning import counted_plans, training_plans, validation_plans
+from neuroprior.priors.learning import counted_plans, plans_for, training_plans, validation_plans
 from neuroprior.priors.neural.gru import gru_sequence
 from neuroprior.priors.neural.neural import NeuralPrior, Sizes, context_embedding
 from neuroprior.priors.prior import Prior
@@ -112,12 +112,14 @@ class StackedPrior(Prior):
         return super().learned | {"network": self.mixer.learned}
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, State]:
+        self.check_start(batch_size, context)
         forecasts, states = zip(*(e.start(batch_size, context_for(e, context)) for e in self._experts()), strict=True)
         ago = torch.full((batch_size, (self.num_contexts or 0) * self.num_actions), LONG_AGO, device=self.device)
         logits, hidden = self.mixer.start(batch_size, self._features(torch.stack(forecasts, 1), ago, context))
         return logits, self._state(hidden, states, ago, context)
 
     def step(self, action: Tensor, state: Any, context: Tensor | None = None) -> tuple[Tensor, State]:
+        self.check_step(action, context)
         hidden, before, ago, *known = state
         if self.num_contexts is not None:
             (last,) = known
@@ -185,7 +187,7 @@ class StackedPrior(Prior):
     def recount(self, plans: Plans) -> Self:
         plans = counted_plans(self, plans)
         for expert in self._experts():
-            expert.fit(plans)
+            expert.fit(plans_for(expert, plans))
         return self
 
     def restore(self, learned: dict[str, Any]) -> None:
@@ -201,7 +203,7 @@ class StackedPrior(Prior):
             for learned, left_out in folds(plans, min(PARTS, units), draw_seed(generator)):
                 part = plans[left_out]
                 for number, expert in enumerate(self._experts()):
-                    expert.fit(plans[learned])
+                    expert.fit(plans_for(expert, plans[learned]))
                     out[left_out, :, number] = expert(part.actions, context_for(expert, part.context))
         return out
 

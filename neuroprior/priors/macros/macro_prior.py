@@ -124,12 +124,14 @@ class MacroPrior(Prior):
 
     @torch.no_grad()  # `fit` trains the inner prior itself
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, State]:
+        self.check_start(batch_size, context)
         logits, state = self._inner().start(batch_size)
         row = torch.arange(batch_size, device=logits.device)
         return self._joined([self._parses(row, logits.new_zeros(batch_size), logits, state)], batch_size)
 
     @torch.no_grad()
     def step(self, action: Tensor, state: Any, context: Tensor | None = None) -> tuple[Tensor, State]:
+        self.check_step(action, context)
         action, groups = action.long(), [_Parses.unpadded(*group) for group in state]
         after = [[parses.within(action, self.symbol_actions)] for parses in groups]
         for place, parses in enumerate(groups):

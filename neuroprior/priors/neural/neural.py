@@ -206,13 +206,17 @@ class NeuralPrior(Prior):
             )
         self.window = None
 
+    @torch.no_grad()
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        self.check_start(batch_size, context)
         previous = torch.full((batch_size,), self.num_actions, device=self.device)
         inputs = self._inputs(previous, context, None)
         logits, hidden = self.encode(inputs[:, None])
         return logits[:, 0], torch.cat([inputs, hidden], 1)
 
+    @torch.no_grad()
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        self.check_step(action, context)
         last, hidden = state[:, : self.input_size], state[:, self.input_size :]
         new = self._inputs(action, context, last)
         logits, hidden = self.encode(new[:, None], None if self.window == 0 else hidden)

@@ -167,11 +167,14 @@ class TransformerPrior(NeuralPrior):
         """Numbers of the key-value cache for each input."""
         return self.num_layers * 2 * self.width
 
+    @torch.no_grad()
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         if not self.writes_in_place(state):
             return super().step(action, state, context)
+        self.check_step(action, context)
         return self._step_in_place(action, state, context)
 
+    @torch.no_grad()
     def advance(
         self, action: Tensor, state: Tensor, context: Tensor | None = None, room: int = 0
     ) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,7 @@ from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.counts.histories import Counts, Tree
 from neuroprior.priors.counts.history_prior import HistoryPrior
-from neuroprior.priors.learning import counted_plans, training_plans
+from neuroprior.priors.learning import counted_plans, plans_for, training_plans
 from neuroprior.priors.prior import taken_of
 from neuroprior.priors.switching.forward_backward import TINY, Smoothed, most_probable_path, predict, smooth
 from neuroprior.priors.switching.mode_chains import ModeChains
@@ -174,11 +174,13 @@ class SwitchingPrior(HistoryPrior):
     # Stepping: the state is the filtered modes and the history.
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, State]:
+        self.check_start(batch_size, context)
         node = self.start_node.long().expand(batch_size)
         context = torch.zeros_like(node) if context is None else context.long()
         return self._forecast(self.first.expand(batch_size, -1), node, context)
 
     def step(self, action: Tensor, state: Any, context: Tensor | None = None) -> tuple[Tensor, State]:
+        self.check_step(action, context)
         contexts, action = self.num_contexts or 1, action.long()
         modes, code = state
         node, last = code.div(contexts, rounding_mode="floor"), code % contexts
@@ -285,7 +287,9 @@ class SwitchingPrior(HistoryPrior):
         if self.order and self.num_modes > 1:
             # Short histories leave more to the modes: those found with them are often better to start from.
             lower = SwitchingPrior(**self.config | {"order": self.order // 2}).to(self.device)
-            starts.append(learner.from_posteriors(lower.fit(plans, generator=generator)._known(plans)))
+            starts.append(
+                learner.from_posteriors(lower.fit(plans_for(lower, plans), generator=generator)._known(plans))
+            )
         short = min(SHORT_RUN, self.max_iterations)
         modes = max((learner.run(start, short) for start in starts), key=lambda run: run[1])[0]
         modes, _ = learner.run(modes, self.max_iterations - short)

@@ -203,10 +203,12 @@ class LogLinearPrior(Prior):
         return torch.cat([self.weights[self.rows(some)].sum(1) for some in parts])
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        self.check_start(batch_size, context)
         last = torch.full((batch_size,), self.num_actions, device=self.device)
         return self._logits_and_state(self.scores(context), last)
 
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        self.check_step(action, context)
         return self._logits_and_state(state[:, :-1] if context is None else self.scores(context), action.long())
 
     def _logits_and_state(self, scores: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:

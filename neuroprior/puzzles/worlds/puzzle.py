@@ -21,6 +21,7 @@ from neuroprior.puzzles.worlds.rules import (
     step_boards,
 )
 from neuroprior.puzzles.worlds.windows import Windows
+from neuroprior.worlds.observations import Patterns
 from neuroprior.worlds.world import World
 
 
@@ -57,6 +58,7 @@ class PuzzleWorld(World):
         distances: Array,
     ) -> None:
         self.boards, self.shape, self.windows = boards, shape, windows
+        self.observation = Patterns(len(windows.windows))
         random, reach = np.random.default_rng(0), windows.radius
         keys = random.integers(2**63, size=(len(kinds) + 1, kinds.shape[1]), dtype=np.uint64)
         shifted = [(row + reach, column + reach, height, width) for row, column, height, width in windows.windows]

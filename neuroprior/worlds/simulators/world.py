@@ -191,7 +191,7 @@ class SimulatorWorld(World):
             seen = [self._observation(handle) for handle in state.tolist()]
         if isinstance(self.observation, Categories):
             return torch.tensor(seen, dtype=torch.long)
-        return torch.from_numpy(np.array(seen, dtype=np.float32).reshape(len(seen), self.observation.size))
+        return torch.from_numpy(np.array(seen, dtype=np.float32).reshape(len(seen), self.observation[0]))
 
     def legal_actions(self, state: Tensor) -> Tensor:
         """Which actions are legal in each state, bool `[N, A]`; where an episode has ended, all."""

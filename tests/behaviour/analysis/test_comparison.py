@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from neuroprior import ContextTreePrior, GRUPrior, MarkovPrior, Plans, UniformPrior
+from neuroprior._statistics import mean_interval, paired_difference, ratio_difference
 from neuroprior.behaviour.analysis.comparison import (
     DEPTH,
     ORDERS,
@@ -21,7 +22,6 @@ from neuroprior.behaviour.analysis.comparison import (
     too_few,
     unit_name,
 )
-from neuroprior.behaviour.analysis.statistics import mean_interval, paired_difference, ratio_difference
 from neuroprior.plans.folds import BLOCKS
 from neuroprior.priors.counts import BACKOFFS_TRIED, HistoryPrior
 from tests.support.sources import FALSE_ALARM, refuses, seeded

@@ -9,8 +9,8 @@ import torch
 from scipy import stats
 
 from neuroprior import Plans
+from neuroprior._statistics import holm, mean_interval, paired_difference, ratio_difference
 from neuroprior.behaviour.analysis.drift import action_drift, by_group, by_plan, by_position
-from neuroprior.behaviour.analysis.statistics import holm, mean_interval, paired_difference, ratio_difference
 from neuroprior.plans.folds import BLOCKS
 from tests.support.sources import FALSE_ALARM, refuses, seeded
 

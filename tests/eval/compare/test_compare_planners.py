@@ -11,7 +11,7 @@ from eval.__main__ import main
 from eval.compare import planners
 from eval.compare.planners import planner_document
 from eval.worlds.aggregates import interquartile_mean
-from neuroprior.behaviour.analysis.statistics import paired_difference
+from neuroprior._statistics import paired_difference
 from tests.support.reports import FROM_ELSEWHERE
 
 pytestmark = pytest.mark.usefixtures("undrawn")

@@ -7,7 +7,7 @@ import torch
 from scipy import stats
 
 from eval.intentions.calibration import calibration_error, count_forecasts, filled_bins
-from neuroprior.behaviour.analysis.statistics import ratio_difference, share_interval
+from neuroprior._statistics import ratio_difference, share_interval
 from tests.support.sources import FALSE_ALARM, seeded
 
 

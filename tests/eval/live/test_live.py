@@ -12,7 +12,7 @@ from eval.live import run as live
 from eval.live.report import live_document, live_frame, live_pairs
 from eval.live.run import PARTS, RANDOM, Condition, LiveSettings, conditions
 from eval.worlds.runs import Run
-from neuroprior.behaviour.analysis.statistics import paired_difference
+from neuroprior._statistics import paired_difference
 from neuroprior.planners import Execution, SamplingPlanner
 from tests.support.reports import FROM_ELSEWHERE
 

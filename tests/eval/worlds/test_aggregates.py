@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from eval.worlds.aggregates import interquartile_gap, interquartile_mean, mean_intervals, probability_of_improvement
-from neuroprior.behaviour.analysis.statistics import mean_interval
+from neuroprior._statistics import mean_interval
 
 
 def test_interquartile_means_are_paired_by_seed():

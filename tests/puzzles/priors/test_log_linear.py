@@ -13,6 +13,7 @@ from neuroprior.priors import load, save
 from neuroprior.puzzles import LogLinearPrior, Steps
 from neuroprior.sampling.ancestral import sample_in_world
 from neuroprior.testing import check_world
+from neuroprior.worlds import Patterns
 from tests.support.sources import seeded
 
 
@@ -124,7 +125,7 @@ def test_actions_are_remembered_without_a_new_context() -> None:
 class Line(World):
     """Cells 0 to 9 of a line, on which the agent steps left or right; the patterns are its cell and its half."""
 
-    num_actions = 2
+    num_actions, observation = 2, Patterns(2)
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         return torch.randint(10, (batch_size,), generator=generator)
@@ -217,7 +218,7 @@ def test_settings_out_of_range_are_refused_and_change_nothing(settings: dict[str
         (lambda: LogLinearPrior(2, 0), "num_patterns"),
         (lambda: LogLinearPrior(3, 2).start(1, torch.zeros(1, 2)), "`context` must be 2 patterns"),
         (lambda: LogLinearPrior(3, 2).start(1, torch.zeros(1, 3, dtype=torch.int32)), "`context` must be 2 patterns"),
-        (lambda: LogLinearPrior(3, 2).start(1), "`context` must be 2 patterns"),
+        (lambda: LogLinearPrior(3, 2).start(1), "takes a context, and none was given"),
         (
             lambda: LogLinearPrior(3, 1).fit_steps(
                 Steps(torch.zeros(2, 1, dtype=torch.int32), torch.tensor([0, 4]), torch.arange(2), torch.arange(2))

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy import stats
 
-from neuroprior.behaviour.analysis.statistics import (
+from neuroprior._statistics import (
     holm,
     mean_interval,
     paired_difference,

@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from scipy import special, stats
 
 from neuroprior._checks import check_count, check_sizes
 
@@ -63,6 +62,8 @@ def mean_interval(values: ArrayLike) -> Interval:
         >>> mean_interval([1.0, 2.0, 3.0, 4.0]).mean
         2.5
     """
+    from scipy import special, stats  # here and below where it is needed: it takes a second to import
+
     values = _vector("values", values)
     mean, error = float(values.mean()), float(stats.sem(values))
     half = float(special.stdtrit(len(values) - 1, 0.975)) * error
@@ -86,6 +87,8 @@ def share_interval(successes: int, trials: int) -> Interval:
         >>> share_interval(9, 10).mean
         0.9
     """
+    from scipy import stats
+
     check_count("successes", successes, 0)
     check_sizes(trials=trials)
     if successes > trials:
@@ -106,6 +109,8 @@ def paired_difference(first: ArrayLike, second: ArrayLike) -> Difference:
     Example:
         >>> found = paired_difference([0.7, 0.8, 0.9, 0.8], [0.6, 0.6, 0.8, 0.7])
     """
+    from scipy import stats
+
     a, b = _vector("first", first), _vector("second", second)
     if len(a) != len(b):
         raise ValueError(f"`second` must have {len(a)} values, as many as `first`, got {len(b)}.")
@@ -135,6 +140,8 @@ def ratio_difference(totals: ArrayLike, sizes: ArrayLike) -> Difference:
     Example:
         >>> found = ratio_difference([-2.0, -3.0], [10.0, 10.0])
     """
+    from scipy import special
+
     above, below = _vector("totals", totals), _vector("sizes", sizes)
     if len(above) != len(below):
         raise ValueError(f"`sizes` must have {len(above)} values, as many as `totals`, got {len(below)}.")
