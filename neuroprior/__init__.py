@@ -37,7 +37,7 @@ if TYPE_CHECKING:
         save,
     )
     from neuroprior.sampling import sample
-    from neuroprior.worlds import TabularWorld, World, from_gymnasium, gridworld
+    from neuroprior.worlds import TabularWorld, World, from_gymnasium, from_simulator, gridworld
 
 __all__ = [
     "CombinedPrior",
@@ -60,6 +60,7 @@ __all__ = [
     "compare",
     "fit",
     "from_gymnasium",
+    "from_simulator",
     "gridworld",
     "load",
     "oracle",

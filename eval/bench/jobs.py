@@ -44,7 +44,8 @@ from neuroprior.priors.ensembles.candidates import DEPTH, ORDERS, networks
 from neuroprior.priors.neural import cuda_graphs as recordings
 from neuroprior.puzzles import AStarPlanner, sliding_tiles
 from neuroprior.sampling import sample_in_world
-from neuroprior.worlds import GridWorld, cube, maze
+from neuroprior.worlds import GridWorld, cube, from_simulator, maze
+from neuroprior.worlds.gymnasium.environment import open_environment
 
 FOUR_ROOMS = "MiniGrid-FourRooms-v0"
 
@@ -447,6 +448,30 @@ def shoot(scale: float) -> Job:
     )
 
 
+def step(kind: str, scale: float) -> Job:
+    """Plans tried in copies of a simulator, against a bare loop of copies and steps."""
+    name = {"cart": "CartPole-v1", "minigrid": FOUR_ROOMS}.get(kind)
+
+    def simulator() -> Any:
+        if name is None:
+            return peers.Slider()
+        env = open_environment(name, {})[0]
+        env.reset(seed=0)
+        return env
+
+    number = 3 if name is None else int(simulator().action_space.n)
+    plans = UniformPrior(number).sample(scaled(256, scale), 20, generator=torch.Generator().manual_seed(0))
+
+    def make(device: torch.device) -> Run:
+        world = from_simulator(simulator(), number)
+        return partial(world.rollout, world.reset(1), plans[None])
+
+    peer = Peer("a bare loop of deepcopy and step", lambda: peers.bare_loop(simulator(), plans), 0.5)
+    return Job(
+        f"{len(plans)} plans of 20 steps in copies of {name or 'a simulator of 2 µs'}", make, (peer,), "minigrid"
+    )
+
+
 def search_tiles(scale: float) -> Job:
     """A*, which no solution stops, so that expansions are compared."""
     world, most = sliding_tiles(shape=(5, 5), scramble=2000), scaled(10_000, scale)
@@ -543,6 +568,8 @@ JOBS |= {
     for policy in ("uniform", "Markov-2", "GRU-64")
     for starts in (1, 64, 1024)
 }
+
+JOBS |= {f"step_{kind}": partial(step, kind) for kind in ("slider", "cart", "minigrid")}
 
 JOBS["train_closer"] = partial(train, within=0.002, goal=1)
 JOBS["sample_few_transformer"] = partial(sample_few, make=TransformerPrior)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuroprior.testing.chi_square import alike
 from neuroprior.testing.rules import FALSE_ALARM, WORLD_CHECKS, check_by_kind, raises, require, same
-from neuroprior.worlds import TabularWorld, World
+from neuroprior.worlds import SimulatorWorld, TabularWorld, World
 
 Simulator = Any
 """A world, of numbered actions or of vectors."""
@@ -212,7 +212,7 @@ def _check_queries(world: Simulator, state: Tensor) -> None:
 def _check_observation(world: World, state: Tensor) -> None:
     """What is observed is declared, and is what was declared."""
     if world.observation is None:
-        silent = type(world).observe is World.observe and "observe" not in vars(world)
+        silent = raises(partial(world.observe, state))
         require(silent, "observation: `observe` is written, but what it gives is not declared")
         return
     try:
@@ -281,8 +281,9 @@ def _check_distribution(world: Simulator, state: Tensor, plans: Tensor, seed: in
     for t in range(plans.shape[1]):
         now, reward = world.step(now, plans[:, t], generator)
         rewards.append(reward)
-    observed = torch.cat([rollout.final_state.reshape(len(now), -1).double(), rollout.rewards[:, 0].double()], 1)
-    due = torch.cat([now.reshape(len(now), -1).double(), torch.stack(rewards, 1).double()], 1)
+    final = _comparable(world, rollout.final_state[:, 0])
+    observed = torch.cat([final, rollout.rewards[:, 0].double()], 1)
+    due = torch.cat([_comparable(world, now), torch.stack(rewards, 1).double()], 1)
     for column in range(observed.shape[1]):
         p = alike(observed[:, column].cpu(), due[:, column].cpu(), group)
         what = "rewards" if column >= observed.shape[1] - plans.shape[1] else "final states"
@@ -292,3 +293,10 @@ def _check_distribution(world: Simulator, state: Tensor, plans: Tensor, seed: in
         require(
             twice.rewards[:, 0].equal(twice.rewards[:, 1]), "rollout: the same plan twice had different random numbers"
         )
+
+
+def _comparable(world: Simulator, state: Tensor) -> Tensor:
+    """What `state [N, ...]` says by itself, float64 `[N, K]`: of a simulator's, which are numbered, the observation."""
+    if isinstance(world, SimulatorWorld):
+        state = state[:, None][:, :0] if world.observation is None else world.observe(state)
+    return state.reshape(len(state), -1).double()

@@ -1,6 +1,7 @@
 """Tables of episodic environments: start states, absorbing terminal states, layouts."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,11 +18,12 @@ class EpisodicWorld(TabularWorld):
     Its objective is "return", as that of the environments it is made from.
 
     Args:
-        next_state, reward, action_names, probability: see `TabularWorld`.
+        next_state, reward, action_names, probability, legal_actions: see `TabularWorld`.
         starts: floating point `[S]`: the probability that an episode starts there.
         ended: `[S]` bool: terminal states, in which every action stays, without reward.
         layouts: integers `[S]`: the layout that each state belongs to; None: there is one.
         features: floating point `[S, C]`: the observations; None: `observe` gives the number of the cell.
+        locate: a function from a running environment to its cell, for `state_of`. It is not pickled with the world.
 
     Attributes:
         starts, ended, features: as given.
@@ -50,10 +52,12 @@ class EpisodicWorld(TabularWorld):
         ended: Tensor,
         *,
         probability: Tensor | None = None,
+        legal_actions: Tensor | None = None,
         layouts: Tensor | None = None,
         features: Tensor | None = None,
+        locate: Callable[[Any], int] | None = None,
     ) -> None:
-        super().__init__(next_state, reward, None, action_names, probability=probability)
+        super().__init__(next_state, reward, legal_actions, action_names, probability=probability)
         for name, table in (("starts", starts), ("ended", ended), ("layouts", layouts), ("features", features)):
             if table is not None and len(table) != self.num_states:
                 raise ValueError(f"`{name}` must be one entry for each of {self.num_states} states, got {len(table)}")
@@ -63,6 +67,7 @@ class EpisodicWorld(TabularWorld):
         if not (self.next_state[here].flatten(1) == here[:, None]).all():
             raise ValueError("ended: every action must stay where an episode has ended")
         self.starts, self.ended, self.features = starts, ended, features
+        self._locate = locate
         if features is not None:
             self.observation = Features(features.shape[1])
         self._layouts = torch.zeros_like(ended, dtype=torch.long) if layouts is None else layouts.long()
@@ -84,6 +89,20 @@ class EpisodicWorld(TabularWorld):
         return cell + self.num_states * torch.randint(
             self.num_maps, (batch_size,), generator=generator, device=self.device
         )
+
+    def state_of(self, env: Any) -> Tensor:
+        """The states `[B]` that stand for the present states of running environments: one, or a list of them.
+
+        Raises:
+            ValueError: this table was not made of an environment, or does not have the state.
+        """
+        if self._locate is None:
+            raise ValueError("state_of: this table was made of no environment, or of one in another process")
+        environments = env if isinstance(env, list | tuple) else [env]
+        return torch.tensor([self._locate(one) for one in environments], dtype=torch.long, device=self.device)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_locate": None}
 
     def layout(self, state: Tensor) -> Tensor:
         """The layout of each state: int64 of the shape of `state`."""

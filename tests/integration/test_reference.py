@@ -89,7 +89,7 @@ WITHOUT_EXAMPLE = {
         *("PermutationDesign", "PlanDrift", "PositionDrift", "Posterior", "Rollout", "Row", "Score", "Search"),
         *("Sizes", "Steps", "Sweep", "TooLargeError", "Transitions", "Tuned", "VectorDecision"),
     },
-    "made by a function that has one": {"PocketCube", "SlidingTilesWorld", "SokobanWorld", "SteppedWorld"},
+    "made by a function that has one": {"PocketCube", "SlidingTilesWorld", "SimulatorWorld", "SokobanWorld"},
     "of packages or data that not everybody has": {"from_mujoco", "read_minari", "write_minari"},
     "figures of the report's tables": {
         *("condition_figure", "drift_figure", "dwell_figure"),

@@ -1,6 +1,5 @@
 """Gymnasium environments as worlds: read or enumerated into tables, or stepped (needs the extra `gym`)."""
 
-from neuroprior.worlds.gymnasium.stepping import SteppedWorld
 from neuroprior.worlds.gymnasium.worlds import from_gymnasium
 
-__all__ = ["SteppedWorld", "from_gymnasium"]
+__all__ = ["from_gymnasium"]

@@ -1,13 +1,13 @@
 """Gymnasium environments: opened without time limits, with named actions, and observations as features."""
 
 import copy
+from collections.abc import Callable
 from enum import Enum
+from functools import partial
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 NAMES = {
     "TaxiEnv": ("south", "north", "east", "west", "pickup", "dropoff"),
@@ -19,11 +19,13 @@ NAMES = {
 REGISTERED_BY = {"MiniGrid": "minigrid", "BabyAI": "minigrid"}
 """Modules that must be imported before Gymnasium knows their environments."""
 
-RUNNING, TERMINATED, TRUNCATED = 0, 1, 2
 
+def open_environment(env: Any, options: dict[str, Any]) -> tuple[Any, Callable[[], Any]]:
+    """The environment without its time limits and checks, and a function that makes others of its kind.
 
-def open_environment(env: Any, options: dict[str, Any]) -> Any:
-    """The environment without its time limits and checks: an instance, or one made from its name.
+    Args:
+        env: an instance, which stays as it is, a name, or a function.
+        options: how one is made from its name.
 
     Raises:
         ImportError: Gymnasium is not installed.
@@ -31,15 +33,24 @@ def open_environment(env: Any, options: dict[str, Any]) -> Any:
     """
     gymnasium = import_gymnasium()
     if isinstance(env, str):
-        env = _make(gymnasium, env, options)
-    elif not isinstance(env, gymnasium.Env):
-        raise ValueError(f"`env` must be the name of an environment or a gymnasium.Env, got {type(env).__name__}")
+        make = partial(_make, env, options)
+        opened = make()
     elif options:
         raise ValueError(f"{next(iter(options))}: options make an environment from its name; this one is made already")
-    env = _without_limits(gymnasium, env)
-    if not isinstance(env.action_space, gymnasium.spaces.Discrete):
-        raise ValueError(f"`env` must have discrete actions, got those of the space {env.action_space}")
-    return env
+    elif isinstance(env, gymnasium.Env):
+        opened = without_limits(env)
+        make = partial(copy.deepcopy, opened)
+    else:
+        opened = without_limits(env()) if callable(env) else env
+        make = partial(_call, env)
+    if not isinstance(opened, gymnasium.Env):
+        raise ValueError(
+            "`env` must be the name of an environment, a gymnasium.Env or a function that makes one, got"
+            f" {type(env).__name__}"
+        )
+    if not isinstance(opened.action_space, gymnasium.spaces.Discrete):
+        raise ValueError(f"`env` must have discrete actions, got those of the space {opened.action_space}")
+    return opened, make
 
 
 def import_gymnasium() -> Any:
@@ -50,7 +61,8 @@ def import_gymnasium() -> Any:
         raise ImportError(f"Gymnasium cannot be used ({error}); pip install 'neuroprior[gym]'") from error
 
 
-def _make(gymnasium: Any, name: str, options: dict[str, Any]) -> Any:
+def _make(name: str, options: dict[str, Any]) -> Any:
+    gymnasium = import_gymnasium()
     for start, module in REGISTERED_BY.items():
         if name.startswith(start):
             try:
@@ -58,30 +70,27 @@ def _make(gymnasium: Any, name: str, options: dict[str, Any]) -> Any:
             except ImportError as error:
                 raise ImportError(f"{name} needs {module} ({error}); pip install 'neuroprior[gym]'") from error
     try:
-        return gymnasium.make(name, disable_env_checker=True, **options)
+        return without_limits(gymnasium.make(name, disable_env_checker=True, **options))
     except (gymnasium.error.Error, ImportError, TypeError, ValueError, AssertionError) as error:
         raise ValueError(f"env: {name} cannot be made: {' '.join(str(error).split())[:200]}") from error
 
 
-def _without_limits(gymnasium: Any, env: Any) -> Any:
-    """`env` without time limits and checks at any depth; other wrappers are kept."""
+def _call(make: Callable[[], Any]) -> Any:
+    return without_limits(make())
+
+
+def without_limits(env: Any) -> Any:
+    """`env` without time limits and checks at any depth; other wrappers are kept, and `env` itself stays as it is."""
+    gymnasium = import_gymnasium()
     wrappers = gymnasium.wrappers
     if not isinstance(env, gymnasium.Wrapper):
         return env
-    inner = _without_limits(gymnasium, env.env)
+    inner = without_limits(env.env)
     if isinstance(env, (wrappers.TimeLimit, wrappers.OrderEnforcing, wrappers.PassiveEnvChecker)):
         return inner
-    outer = copy.copy(env)  # the caller's wrapper stays as it is
+    outer = copy.copy(env)
     outer.env = inner
     return outer
-
-
-def layers(env: Any) -> list[Any]:
-    """The wrappers of an environment from the outermost inwards, and the environment itself."""
-    found = [env]
-    while "env" in vars(found[-1]):
-        found.append(found[-1].env)
-    return found
 
 
 def action_names(env: Any) -> tuple[str, ...] | None:
@@ -94,54 +103,45 @@ def action_names(env: Any) -> tuple[str, ...] | None:
     return names if len(names) == number else None
 
 
-class Transition(NamedTuple):
-    """What one step gives: the observation, float32 `[C]`, the reward, and whether and how the episode ended."""
-
-    features: np.ndarray[Any, Any]
-    reward: float
-    end: int
-
-
-class Episode:
-    """An environment in which actions count from 0 and observations are features.
+class Flattener:
+    """The numbers in observations of any space, concatenated, without texts and all that has no fixed length.
 
     Args:
-        env: with discrete actions.
+        space: of the observations.
 
     Attributes:
-        env: the environment; others of its kind may be put in its place.
-        num_actions: number of actions.
+        size: how many numbers there are.
     """
 
-    def __init__(self, env: Any) -> None:
-        self.env = env
-        self.num_actions = int(env.action_space.n)
-        self._first, self._space = int(env.action_space.start), env.observation_space
-        self._spaces = import_gymnasium().spaces
+    def __init__(self, space: Any) -> None:
+        self._space = space
+        self.size = len(self(copy.deepcopy(space).sample()))
 
-    def reset(self, seed: int) -> np.ndarray[Any, Any]:
-        """Reset from `seed`; the observation, float32 `[C]`."""
-        observation, _ = self.env.reset(seed=seed)
-        return self._features(self._space, observation)
+    def __call__(self, observation: Any) -> np.ndarray[Any, Any]:
+        """float32 `[C]`."""
+        return self._flatten(self._space, observation)
 
-    def step(self, action: int) -> Transition:
-        """Take an action."""
-        observation, reward, terminated, truncated, _ = self.env.step(action + self._first)
-        end = TERMINATED if terminated else TRUNCATED if truncated else RUNNING
-        return Transition(self._features(self._space, observation), float(reward), end)
-
-    def _features(self, space: Any, observation: Any) -> np.ndarray[Any, Any]:
-        """The numbers in an observation of any space, concatenated, without texts and all that has no fixed length."""
-        spaces = self._spaces
+    def _flatten(self, space: Any, observation: Any) -> np.ndarray[Any, Any]:
+        spaces = import_gymnasium().spaces
         if isinstance(space, spaces.Dict):
-            parts = [self._features(inner, observation[key]) for key, inner in space.spaces.items()]
+            parts = [self._flatten(inner, observation[key]) for key, inner in space.spaces.items()]
         elif isinstance(space, spaces.Tuple):
-            parts = [self._features(inner, part) for inner, part in zip(space.spaces, observation, strict=True)]
+            parts = [self._flatten(inner, part) for inner, part in zip(space.spaces, observation, strict=True)]
         elif _is_flat(space) and not isinstance(space, spaces.Text):
             parts = [np.asarray(spaces.flatten(space, observation), dtype=np.float32).ravel()]
         else:
             parts = []
         return np.concatenate([np.zeros(0, np.float32), *parts])
+
+
+def has_real_numbers(space: Any) -> bool:
+    """Whether observations of `space` hold floating point numbers."""
+    spaces = import_gymnasium().spaces
+    if isinstance(space, spaces.Dict):
+        return any(has_real_numbers(inner) for inner in space.spaces.values())
+    if isinstance(space, spaces.Tuple):
+        return any(has_real_numbers(inner) for inner in space.spaces)
+    return isinstance(space, spaces.Box) and bool(np.issubdtype(space.dtype, np.floating))
 
 
 def _is_flat(space: Any) -> bool:
@@ -150,8 +150,3 @@ def _is_flat(space: Any) -> bool:
         return bool(space.is_np_flattenable)
     except NotImplementedError:  # custom spaces need not say
         return False
-
-
-def stacked(features: list[np.ndarray[Any, Any]]) -> Tensor:
-    """float32 `[N, C]`."""
-    return torch.from_numpy(np.stack(features))

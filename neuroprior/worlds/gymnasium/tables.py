@@ -4,23 +4,21 @@ import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
+from itertools import product
 from typing import Any
 
 import numpy as np
 import torch
 
 from neuroprior.worlds.episodes import EpisodicWorld
-from neuroprior.worlds.gymnasium.environment import RUNNING, TRUNCATED, Episode, Transition, action_names, stacked
-from neuroprior.worlds.gymnasium.states import (
-    Copier,
-    Counters,
-    digest,
-    exact_copier,
-    first_difference,
-    nondeterminism,
-    reseed,
-    walks,
-)
+from neuroprior.worlds.gymnasium.counters import NUM_WALKS, WALK_LENGTH, Counters
+from neuroprior.worlds.gymnasium.environment import action_names, without_limits
+from neuroprior.worlds.simulators.copies import ReplayCopier
+from neuroprior.worlds.simulators.driver import TRUNCATED, View
+from neuroprior.worlds.simulators.fingerprints import digest
+from neuroprior.worlds.simulators.generators import keep_global_generators, seed_generators
+from neuroprior.worlds.simulators.trials import Start
+from neuroprior.worlds.simulators.world import SimulatorWorld
 
 CHECKED_FIRST, CHECKED_EVERY = 100, 10
 """Transitions are repeated, as a check, from so many states at first, and from every so many after them."""
@@ -58,8 +56,13 @@ def read_table(env: Any) -> EpisodicWorld:
     starts[:states] = torch.as_tensor(base.initial_state_distrib, dtype=torch.float64)
     names = action_names(env)
     if probability.shape[-1] == 1:
-        return EpisodicWorld(next_state[..., 0], reward[None, ..., 0], names, starts, ended)
-    return EpisodicWorld(next_state, reward[None], names, starts, ended, probability=probability)
+        return EpisodicWorld(next_state[..., 0], reward[None, ..., 0], names, starts, ended, locate=_present)
+    return EpisodicWorld(next_state, reward[None], names, starts, ended, probability=probability, locate=_present)
+
+
+def _present(env: Any) -> int:
+    """The state in which a toy text is."""
+    return int(env.unwrapped.s)
 
 
 def _outcomes(table: Any, actions: int) -> tuple[torch.Tensor, ...]:
@@ -97,27 +100,32 @@ def _absorbing(next_state: torch.Tensor, probability: torch.Tensor, ends: torch.
     return next_state, ended
 
 
-def enumerate_states(env: Any, seeds: list[int], max_states: int, progress: bool, observations: bool) -> EpisodicWorld:
-    """The table of all states that can be reached from `env.reset(seed=seed)` for each seed; see `from_gymnasium`.
+def enumerate_states(
+    world: SimulatorWorld, max_states: int, observations: bool, progress: bool, seed: int
+) -> EpisodicWorld:
+    """The table of all states that can be reached from the starts of a world; see `from_gymnasium`.
+
+    Args:
+        world: steps copies of an environment.
+        max_states, observations, progress: see `from_gymnasium`.
+        seed: of the walks by which the table is checked.
 
     Raises:
         ValueError: it is stochastic, cannot be copied, or has more than `max_states` states.
     """
-    episode = Episode(env)
-    difference = nondeterminism(episode, seeds[0])
-    if difference is not None:
-        raise ValueError(f"env: {difference} differs between two trajectories of the same actions from seed {seeds[0]}")
-    copier = exact_copier(episode, seeds[0])
-    if copier is None:
+    if world.stochastic:
+        raise ValueError('env: it is stochastic, so that its states cannot be enumerated; use method="step"')
+    if isinstance(world.copier, ReplayCopier):
         raise ValueError('env: copies of it do not behave as it does; use method="step"')
-    search = _Search(episode, copier, Counters(episode, seeds[0]), max_states)
-    with _bar(progress) as show:
-        for layout, seed in enumerate(seeds):
-            search.add_layout(layout, seed, show)
-    world = search.world(observations)
-    for layout, seed in enumerate(seeds):
-        search.check_walks(layout, seed)
-    return world
+    with keep_global_generators():
+        counters = Counters(world.driver, world.copier, world.starts[0], seed)
+        search = _Search(world, counters, max_states)
+        with _bar(progress) as show:
+            for layout, start in enumerate(world.starts):
+                search.add_layout(layout, start, show)
+        for layout, start in enumerate(world.starts):
+            search.check_walks(layout, start, np.random.default_rng(seed))
+        return search.table(world.action_names, observations)
 
 
 class _Search:
@@ -125,78 +133,64 @@ class _Search:
 
     Attributes:
         next_state, rewards: rows of the table so far.
-        layouts, ended, features: of each state so far.
+        layouts, ended, observations, masks: of each state so far.
     """
 
-    def __init__(self, episode: Episode, copier: Copier, counters: Counters, max_states: int) -> None:
-        self.episode, self.copier, self.counters, self.max_states = episode, copier, counters, max_states
+    def __init__(self, world: SimulatorWorld, counters: Counters, max_states: int) -> None:
+        self.driver, self.copier, self.counters, self.max_states = world.driver, world.copier, counters, max_states
         self.next_state: list[list[int]] = []
         self.rewards: list[list[float]] = []
         self.layouts: list[int] = []
         self.ended: list[bool] = []
-        self.features: list[np.ndarray[Any, Any]] = []
+        self.observations: list[Any] = []
+        self.masks: list[np.ndarray[Any, Any]] = []
         self.starts: list[int] = []
         self._numbers: dict[tuple[int, bytes, bool], int] = {}
         self._raw: dict[tuple[int, bytes, bool], int] = {}
         self._waiting: dict[int, Any] = {}
-        self._env = episode.env
 
-    def add_layout(self, layout: int, seed: int, show: Callable[[int, int], None]) -> None:
-        """All states that can be reached from `seed`."""
-        self.episode.env = self._env
-        step = self.episode.reset(seed)
-        self.counters.remember(self._env)
-        self.episode.env = self.copier.restore(self.copier.save(self._env))  # a copy, like all others
-        self.starts.append(self._number(layout, Transition(step, 0.0, RUNNING)))
-        for state in iter(lambda: len(self.next_state), None):
-            if state == len(self.layouts):
-                break
+    def add_layout(self, layout: int, start: Start, show: Callable[[int, int], None]) -> None:
+        """All states that can be reached from a start."""
+        simulator = self.copier.load(start.saved)
+        self.counters.remember(simulator)
+        self.starts.append(self._number(layout, simulator, start.view, False))
+        while len(self.next_state) < len(self.layouts):
+            state = len(self.next_state)
+            row, rewards = [state] * self.driver.num_actions, [0.0] * self.driver.num_actions
             saved = self._waiting.pop(state, None)
-            if self.ended[state]:
-                self.next_state.append([state] * self.episode.num_actions)
-                self.rewards.append([0.0] * self.episode.num_actions)
-            else:
-                self._expand(layout, state, saved)
+            for action in [] if self.ended[state] else np.flatnonzero(self.masks[state]).tolist():
+                seed = state * self.driver.num_actions + action
+                row[action], rewards[action] = self._try(layout, saved, action, 2 * seed)
+                if state < CHECKED_FIRST or state % CHECKED_EVERY == 0:
+                    again = self._try(layout, saved, action, 2 * seed + 1)
+                    if again != (row[action], rewards[action]):
+                        raise ValueError(
+                            f"env: action {action} led to two different states from the same one;"
+                            ' use method="step", which tries plans under several random numbers'
+                        )
+            self.next_state.append(row)
+            self.rewards.append(rewards)
             show(len(self.next_state), len(self.layouts))
 
-    def _expand(self, layout: int, state: int, saved: Any) -> None:
-        """The row of one state."""
-        row, rewards = [], []
-        for action in range(self.episode.num_actions):
-            found = self._try(layout, saved, action)
-            if state < CHECKED_FIRST or state % CHECKED_EVERY == 0:
-                again = self._try(layout, saved, action, other_seed=state * self.episode.num_actions + action)
-                if again != found:
-                    raise ValueError(
-                        f"env: action {action} led to two different states from the same one;"
-                        ' use method="step" where the seed may fix what is random'
-                    )
-            row.append(found[0])
-            rewards.append(found[1])
-        self.next_state.append(row)
-        self.rewards.append(rewards)
+    def _try(self, layout: int, saved: Any, action: int, seed: int) -> tuple[int, float]:
+        """Where an action leads from a saved state under the random numbers of a seed, and its reward."""
+        simulator = self.copier.load(saved)
+        seed_generators(self.copier.generators(simulator), seed)
+        observation, reward, ended, info = self.driver.take(simulator, action)
+        view = self.driver.view(simulator, observation, info)
+        return self._number(layout, simulator, view, bool(ended or self.driver.end(view))), reward
 
-    def _try(self, layout: int, saved: Any, action: int, other_seed: int | None = None) -> tuple[int, float]:
-        """Where an action leads from a saved state, and its reward; with `other_seed` under other random numbers."""
-        self.episode.env = self.copier.restore(saved)
-        if other_seed is not None:
-            reseed(self.episode.env, other_seed)
-        step = self.episode.step(action)
-        return self._number(layout, step), step.reward
-
-    def _number(self, layout: int, step: Transition) -> int:
-        """The number of the state in which the environment is; a new one is saved."""
-        env, end = self.episode.env, step.end != RUNNING
-        self.counters.set_back(env)
-        saved = self.copier.save(env)
-        raw = None
-        if isinstance(saved, bytes):  # most states are recognised by their pickles, which are fast to compare
-            raw = (layout, hashlib.blake2b(saved, digest_size=16).digest(), end)
-            if raw in self._raw:
-                return self._raw[raw]
-        key = (layout, digest(env), end)
+    def _number(self, layout: int, simulator: Any, view: View, ended: bool) -> int:
+        """The number of the state in which a simulator is; a new one is saved."""
+        self.counters.set_back(simulator)
+        saved = self.copier.save(simulator, (None, [], 0))
+        text = self.copier.text(saved)  # most states are recognised by their pickles, which are fast to compare
+        raw = (layout, hashlib.blake2b(text, digest_size=16).digest(), ended)
+        if text and raw in self._raw:
+            return self._raw[raw]
+        key = (layout, self._digest(simulator), ended)
         number = self._numbers.setdefault(key, len(self._numbers))
-        if raw is not None:
+        if text:
             self._raw[raw] = number
         if number == len(self.layouts):
             if number == self.max_states:
@@ -205,53 +199,76 @@ class _Search:
                     ' allow more, or use method="step"'
                 )
             self.layouts.append(layout)
-            self.ended.append(end)
-            self.features.append(step.features)
-            if not end:
+            self.ended.append(ended)
+            self.observations.append(view.observation)
+            legal = np.ones(self.driver.num_actions, bool)
+            self.masks.append(legal if view.mask is None or ended else view.mask)
+            if not ended:
                 self._waiting[number] = saved
         return number
 
-    def world(self, observations: bool) -> EpisodicWorld:
+    def _digest(self, simulator: Any) -> bytes:
+        try:
+            return digest(simulator)
+        except ValueError as error:
+            raise ValueError(f'env: {error}; use method="step"') from error
+
+    def locate(self, env: Any) -> int:
+        """The number of the state in which an environment is, which stays as it is.
+
+        Raises:
+            ValueError: the table has no such state.
+        """
+        with keep_global_generators():
+            simulator = self.copier.load(self.copier.enter(without_limits(env), 0))
+            self.counters.set_back(simulator)
+            state = self._digest(simulator)
+        for layout, ended in product(range(len(self.starts)), (False, True)):
+            if (layout, state, ended) in self._numbers:
+                return self._numbers[layout, state, ended]
+        raise ValueError("`env` must be in a state of the table, got another one: of a start by another seed, perhaps")
+
+    def table(self, names: tuple[str, ...] | None, observations: bool) -> EpisodicWorld:
         """The table."""
         starts = torch.zeros(len(self.layouts), dtype=torch.float64)
         starts[self.starts] = 1 / len(self.starts)
+        legal = torch.from_numpy(np.stack(self.masks))
         return EpisodicWorld(
             torch.tensor(self.next_state),
             torch.tensor(self.rewards)[None],
-            action_names(self._env),
+            names,
             starts,
             torch.tensor(self.ended),
+            legal_actions=None if legal.all() else legal,
             layouts=torch.tensor(self.layouts),
-            features=stacked(self.features) if observations else None,
+            features=torch.from_numpy(np.stack(self.observations)) if observations else None,
+            locate=self.locate,
         )
 
-    def check_walks(self, layout: int, seed: int) -> None:
-        """Compare random walks in the environment itself with the table.
+    def check_walks(self, layout: int, start: Start, draw: np.random.Generator) -> None:
+        """Compare random walks of copies with the table.
 
         Raises:
             ValueError: they differ.
         """
-        self.episode.env = self._env
-        for actions in walks(self.episode.num_actions):
-            self.episode.reset(seed)
-            state, real, table = self.starts[layout], [], []
-            for action in actions:
-                step = self.episode.step(action)
-                reward = self.rewards[state][action]
-                state = self.next_state[state][action]
-                if step.end == TRUNCATED and not self.ended[state]:
+        for _ in range(NUM_WALKS):
+            simulator, state = self.copier.load(start.saved), self.starts[layout]
+            for t in range(1, WALK_LENGTH + 1):
+                action = int(draw.choice(np.flatnonzero(self.masks[state])))
+                observation, reward, ended, info = self.driver.take(simulator, action)
+                expected, state = self.rewards[state][action], self.next_state[state][action]
+                if ended == TRUNCATED and not self.ended[state]:
                     break  # a time limit, which the table does not have
-                known = not self.counters.names  # else rewards may depend on them
-                real.append(Transition(step.features, step.reward if known else 0.0, int(step.end != RUNNING)))
-                table.append(Transition(self.features[state], reward if known else 0.0, int(self.ended[state])))
-                if step.end:
+                view = self.driver.view(simulator, observation, info)
+                same = np.array_equal(view.observation, self.observations[state], equal_nan=True)
+                same = same and bool(ended or self.driver.end(view)) == self.ended[state]
+                if not same or (reward != expected and not self.counters.names):
+                    raise ValueError(
+                        f"env: action {t} of a walk led to something else than in its table: it is stochastic, or its"
+                        ' state is not in its attributes; use method="step"'
+                    )
+                if ended:
                     break
-            difference = first_difference(real, table)
-            if difference is not None:
-                raise ValueError(
-                    f"env: {difference} differs between the environment and its table: it is stochastic, or its"
-                    ' state is not in its attributes; use method="step"'
-                )
 
 
 @contextmanager
