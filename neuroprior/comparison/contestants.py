@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from functools import partial
-from math import isqrt
 from typing import Any, TypeAlias
 
 import torch
@@ -16,7 +15,6 @@ from neuroprior.priors.construction import context_arguments
 from neuroprior.priors.ensembles.candidates import best_chain, counting_parts
 from neuroprior.priors.fitting import PRIORS, MakePrior, make_prior, name_of
 from neuroprior.sampling import Steppable
-from neuroprior.sampling.stepping import Stepper
 from neuroprior.worlds import World
 
 BASELINE = "uniform"
@@ -124,18 +122,10 @@ def fit_markov(plans: Plans, generator: torch.Generator) -> MarkovPrior:
     return max((chain for chain in tried if chain is not None), key=log_likelihood)
 
 
-def make_planner(source: str | MakePlanner, prior: Steppable, world: World, length: int, budget: int) -> Planner:
-    """A planner that takes at most `budget * length` simulator steps for each start.
-
-    In a stochastic world the sampling planner tries a root of the budget of plans, each about as many times. A prior
-    that is stepped along with the world takes one more rollout a plan.
-    """
+def make_planner(source: str | MakePlanner, prior: Steppable, length: int, budget: int) -> Planner:
+    """A planner that takes at most `budget * length` simulator steps for each start."""
     make = PLANNERS[source] if isinstance(source, str) else source
-    if source != "sampling" or not world.stochastic:
-        return make(prior, length=length, num_plans=budget)
-    in_world = Stepper(prior).context_per is not None
-    tries = max(isqrt(budget), 1 + in_world)
-    return make(prior, length=length, num_plans=max(budget // tries, 1), num_rollouts=tries - in_world)
+    return make(prior, length=length, num_plans=budget)
 
 
 def _by_name(argument: str, values: object, name: Callable[[Any], str]) -> dict[str, Any]:

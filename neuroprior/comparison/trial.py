@@ -144,7 +144,7 @@ def run_seed(
         for k, (planner_name, make) in enumerate(design.planners.items()):
             tell(f"planning with {name} and {planner_name}")
             for b, budget in enumerate(design.budgets):
-                planner = make_planner(make, prior, held_out, design.length, budget)
+                planner = make_planner(make, prior, design.length, budget)
                 decision = planner.plan(held_out, state, fresh(plan_seed))
                 check_decision(decision, planner_name, design.length, budget)
                 actual = true_scores(held_out, state, decision.plan[:, None], score_seed)
@@ -188,7 +188,7 @@ def training_plans(design: Design, state: Tensor, generator: torch.Generator) ->
     """
     world, uniform = design.world, UniformPrior(design.world.num_actions)
     name = "sampling" if world.stochastic else "frontier"
-    planner = make_planner(name, uniform, world, design.length, design.training_budget)
+    planner = make_planner(name, uniform, design.length, design.training_budget)
     context: Literal["step"] | None = None if world.observation is None else "step"
     plans = collect(planner, world, state=state, context=context, generator=generator)
     if isinstance(world.observation, Categories):

@@ -8,7 +8,7 @@ from torch import Tensor
 from neuroprior._checks import check_sizes
 from neuroprior._random import generator_on
 from neuroprior.planners.planner import Decision, Objective, Planner, decide, join_decisions, random_best
-from neuroprior.planners.rollouts import mean_scores
+from neuroprior.planners.rollouts import mean_scores, score_anew
 from neuroprior.plans import action_dtype, all_plans
 from neuroprior.worlds.world import World, allowed_actions, check_is_world, step_alive
 
@@ -19,7 +19,7 @@ class ExhaustivePlanner(Planner):
     """Tries all plans of `depth` actions: Hyvärinen's deterministic planner.
 
     Plans that share a prefix share its steps, so that a decision takes A + A**2 + ... + A**depth simulator steps. In a
-    stochastic world each plan is tried by itself, which takes num_rollouts * depth * A**depth.
+    stochastic world each plan is tried by itself, which takes num_rollouts * depth * (A**depth + 1).
 
     Args:
         depth: number of actions in a plan, at least 1; A**depth may be at most 2**24.
@@ -49,7 +49,7 @@ class ExhaustivePlanner(Planner):
         world.check_state(state)
         planner, generator = self.for_world(world), generator_on(generator, state.device)
         if world.stochastic:
-            plan_some, steps = planner._plan_apart, self.num_rollouts * self.depth * actions**self.depth
+            plan_some, steps = planner._plan_apart, self.num_rollouts * self.depth * (actions**self.depth + 1)
         else:
             plan_some, steps = planner._plan_together, sum(actions**depth for depth in range(1, self.depth + 1))
         chunks = self.chunks(state, steps, cached=not world.stochastic)
@@ -102,7 +102,8 @@ class ExhaustivePlanner(Planner):
             ending = torch.arange(len(plans), device=state.device)[:, None] % rest == 0
         plans = plans.expand(len(state), -1, -1)
         score, ends = mean_scores(self, world, state, plans, self.num_rollouts, generator)
-        return decide(plans, score, ends, steps, generator, ending)
+        decision = decide(plans, score, ends, steps, generator, ending)
+        return score_anew(self, world, state, decision, self.num_rollouts, generator)
 
 
 def _for_each(actions: int, values: Tensor) -> Tensor:

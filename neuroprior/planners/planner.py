@@ -52,8 +52,8 @@ class Decision(NamedTuple):
 
     Attributes:
         plan: `[B, L]`: the best plan that it found; 0 beyond `lengths`.
-        score: `[B]`: the score of that plan; in a stochastic world its mean over the planner's own rollouts, which is
-            biased upwards for the best of several plans (the winner's curse; `expected_score` is not).
+        score: `[B]`: the score of that plan; in a stochastic world its mean over rollouts that had no part in the
+            choice.
         final_state: `[B, ...]`: where the plan (where there are `lengths`, its executed part) ends; in a stochastic
             world, in the first of the planner's rollouts.
         model_steps: single simulator steps taken for each start.

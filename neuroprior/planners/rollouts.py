@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from neuroprior._random import draw_seed
-from neuroprior.planners.planner import Planner, random_top
+from neuroprior.planners.planner import Decision, Planner, random_top
 from neuroprior.worlds.world import World
 
 
@@ -62,6 +62,25 @@ def mean_scores(
         scores.append(mean.to(score.dtype))
         ends.append(end[::num_rollouts])
     return torch.cat(scores, 1), torch.cat(ends, 1)
+
+
+def score_anew(
+    planner: Planner, world: World, state: Tensor, decision: Decision, num_rollouts: int, generator: torch.Generator
+) -> Decision:
+    """The decision with the mean score of new rollouts of its plan: that by which it was chosen is too high.
+
+    The best of many noisy means is biased upwards (the winner's curse).
+
+    Args:
+        planner, world, state, num_rollouts, generator: see `mean_scores`.
+        decision: for these states.
+    """
+    score, ends = mean_scores(planner, world, state, decision.plan[:, None], num_rollouts, generator)
+    score, ends = score[:, 0], ends[:, 0]
+    if decision.lengths is not None:
+        row = torch.arange(len(score), device=score.device)
+        score, ends = score[row, decision.lengths - 1], ends[row, decision.lengths - 1]
+    return decision._replace(score=score, final_state=ends)
 
 
 def halved_scores(

@@ -1,6 +1,7 @@
 """The sampling planner: draws candidate plans from a prior and decides for the best of them."""
 
 from collections.abc import Sequence
+from math import isqrt
 from typing import Unpack
 
 import torch
@@ -8,7 +9,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_flags, check_share, check_sizes
 from neuroprior.planners.planner import Decision, Objective, PriorPlanner, decide, join_decisions
-from neuroprior.planners.rollouts import halved_scores, halving_rounds, mean_scores
+from neuroprior.planners.rollouts import halved_scores, halving_rounds, mean_scores, score_anew
 from neuroprior.planners.sources import Sources
 from neuroprior.priors.uniform import UniformPrior
 from neuroprior.sampling.ancestral import sample, sample_in_world
@@ -23,7 +24,8 @@ class SamplingPlanner(PriorPlanner):
     not all actions are legal everywhere, is stepped together with the world.
 
     In a stochastic world a plan is a sequence of actions that is executed whatever happens. A prior with a context
-    draws each plan along one random trajectory; all plans are then scored by new rollouts.
+    draws each plan along one random trajectory; all plans are then scored by new rollouts. The best of many means is
+    too high, so that the chosen plan is scored once more, by as many rollouts: that is the score of the decision.
 
     Several priors, given as a list, share the candidates of a decision with a uniform one, see `Sources`: those that
     had the best candidate more often draw more of the next. So a prior that was learned from few plans, or in a world
@@ -33,8 +35,9 @@ class SamplingPlanner(PriorPlanner):
         prior: proposes the candidates; `UniformPrior(A)` makes the random planner. Or a list of priors.
         length: number of actions in a plan, at least 1.
         num_plans: number of candidates for each start, at least 1.
-        num_rollouts: in a stochastic world, the score of a plan is its mean over so many rollouts, with common random
+        num_rollouts: in a stochastic world, plans are chosen by their means over so many rollouts, with common random
             numbers for all plans of a start where the world can (see `World.rollout`). A deterministic world takes one.
+            None: the budget of `num_plans` rollouts is divided: about its root of plans are tried, each as often.
         halving: spend as many rollouts unequally: after each of several rounds the worse half of the plans is dropped,
             so that the better ones are tried more often (see `planners.rollouts.halved_scores`).
         temperature: divides the prior's logits.
@@ -59,7 +62,7 @@ class SamplingPlanner(PriorPlanner):
         length: int,
         num_plans: int,
         *,
-        num_rollouts: int = 1,
+        num_rollouts: int | None = None,
         halving: bool = False,
         temperature: float = 1.0,
         uniform_share: float = 0.0,
@@ -68,7 +71,8 @@ class SamplingPlanner(PriorPlanner):
         self.sources = Sources(prior) if isinstance(prior, Sequence) else None
         first = prior[0] if isinstance(prior, Sequence) else prior
         super().__init__(first, length, num_plans, temperature=temperature, **goal)
-        check_sizes(num_rollouts=num_rollouts)
+        if num_rollouts is not None:
+            check_sizes(num_rollouts=num_rollouts)
         check_flags(halving=halving)
         check_share("uniform_share", uniform_share)
         if self.sources is not None and (halving or uniform_share):
@@ -85,8 +89,11 @@ class SamplingPlanner(PriorPlanner):
         def plan_some(some: Tensor) -> Decision:
             plans, score, ends = self.candidates(world, some, generator)
             if self.sources is not None:
-                wins.append(wins_of(score, self.sources.counts(world, self.num_plans)))
-            return decide(plans, score, ends, steps, generator, keep=self.keep_candidates)
+                wins.append(wins_of(score, self.sources.counts(world, self.effort(world)[0])))
+            decision = decide(plans, score, ends, steps, generator, keep=self.keep_candidates)
+            if not world.stochastic or plans.shape[1] == 1:
+                return decision
+            return score_anew(self, world, some, decision, self.effort(world)[1], generator)
 
         decision = join_decisions(map(plan_some, chunks), len(state))
         if self.sources is not None:
@@ -112,18 +119,30 @@ class SamplingPlanner(PriorPlanner):
             return plans, score, ends
         # Together, so that all plans of a start meet the same random numbers.
         plans = drawn[0][0] if len(drawn) == 1 else torch.cat([plans for plans, _ in drawn], 1)
+        num_rollouts = self.effort(world)[1]
         if self.halving:
-            return halved_scores(self, world, state, plans, self.num_rollouts, generator)
-        return plans, *mean_scores(self, world, state, plans, self.num_rollouts, generator)
+            return halved_scores(self, world, state, plans, num_rollouts, generator)
+        return plans, *mean_scores(self, world, state, plans, num_rollouts, generator)
+
+    def effort(self, world: World) -> tuple[int, int]:
+        """How many plans are tried from each start, and how often each."""
+        if not world.stochastic or self.num_rollouts is not None:
+            return self.num_plans, self.num_rollouts or 1
+        priors = [self.prior] if self.sources is None else self.sources.priors
+        in_world = any(Stepper(prior).context_per is not None for prior in priors)
+        times = max(isqrt(self.num_plans), 1 + in_world)
+        num_rollouts = times - in_world
+        return max((self.num_plans - num_rollouts) // times, 1), num_rollouts
 
     def _proposals(self, world: World) -> list[tuple[Steppable, int, float]]:
         """The priors that draw candidates, how many each draws, and at which temperature."""
+        num_plans = self.effort(world)[0]
         if self.sources is not None:
-            counts = self.sources.counts(world, self.num_plans)
+            counts = self.sources.counts(world, num_plans)
             pairs = zip(self.sources.priors, counts, strict=True)
             return [(one, n, 1.0 if isinstance(one, UniformPrior) else self.temperature) for one, n in pairs]
-        uniform = uniform_plans(self.uniform_share, self.num_plans)
-        proposals: list[tuple[Steppable, int, float]] = [(self.prior, self.num_plans - uniform, self.temperature)]
+        uniform = uniform_plans(self.uniform_share, num_plans)
+        proposals: list[tuple[Steppable, int, float]] = [(self.prior, num_plans - uniform, self.temperature)]
         if uniform:
             proposals.append((UniformPrior(world.num_actions).to(Stepper(self.prior).device), uniform, 1.0))
         return proposals
@@ -152,15 +171,17 @@ class SamplingPlanner(PriorPlanner):
         """The plans, their scores and final states in a deterministic world."""
         if rollout is not None:
             return plans, *self.for_world(world).score_rollout(rollout)
-        return plans, *mean_scores(self, world, state, plans, self.num_rollouts, generator)
+        return plans, *mean_scores(self, world, state, plans, 1, generator)
 
     def model_steps(self, world: World) -> int:
         """Simulator steps for each start."""
         if not world.stochastic:
             return self.num_plans * self.length
-        tries = self.num_plans * self.num_rollouts
+        num_plans, num_rollouts = self.effort(world)
+        tries = num_plans * num_rollouts
         if self.halving:
-            tries = sum(kept * times for kept, times in halving_rounds(self.num_plans, self.num_rollouts))
+            tries = sum(kept * times for kept, times in halving_rounds(num_plans, num_rollouts))
+        tries += num_rollouts * (num_plans > 1)  # of the plan that was chosen
         proposals = self._proposals(world)
         in_world = sum(number for prior, number, _ in proposals if Stepper(prior).context_per is not None)
         return (tries + in_world) * self.length

@@ -155,7 +155,7 @@ def _decided(
     if not world.stochastic:
         return estimates.gather(1, best)[:, 0]
     row = torch.arange(len(plans), device=plans.device)[:, None]
-    scores, _ = mean_scores(planner, world, state, plans[row, best], planner.num_rollouts, generator)
+    scores, _ = mean_scores(planner, world, state, plans[row, best], planner.effort(world)[1], generator)
     return scores[:, 0] if prefix is None else scores[:, 0].gather(1, prefix.gather(1, best))[:, 0]
 
 

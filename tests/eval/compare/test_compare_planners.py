@@ -38,11 +38,10 @@ def test_a_small_comparison(tmp_path, capsys, monkeypatch):
     assert {row["prior"] for row in rows} == {"uniform", "markov-3"}
     for row in rows:
         length = {"grid": 8, "slippery": 14 * 16}[row["world"]]
-        assert 0 < row["model_steps"] <= max(row["num_plans"], 14 * (row["world"] == "slippery")) * length
-        assert (
-            row["planner"] in ("frontier", "mcts", "halving", "replanning")
-            or row["model_steps"] == row["num_plans"] * length
-        )
+        noisy = row["world"] == "slippery"  # where the plan that was chosen is tried once more
+        assert 0 < row["model_steps"] <= max(row["num_plans"] + noisy, 14 * noisy) * length
+        others = row["planner"] in ("frontier", "mcts", "halving", "replanning")
+        assert others or row["model_steps"] == (row["num_plans"] + noisy) * length
         assert row["oracle_share"] <= 1 + 1e-6 or row["world"] == "slippery"
     with (out / "paired.csv").open() as file:
         assert len(list(csv.DictReader(file))) == len(results["paired"]) == 2 * (2 * 2) + 2 * (2 * 2)
