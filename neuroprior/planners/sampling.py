@@ -190,14 +190,16 @@ class SamplingPlanner(PriorPlanner):
 def wins_of(score: Tensor, counts: list[int]) -> Tensor:
     """In how many decisions each source had the best candidate: float64 `[K]`; of equally good ones each has its part.
 
+    Where all candidates are equally good, nothing is known of the sources, and all have the same part.
+
     Args:
         score: `[B, P]`, or `[B, P, L]` of all prefixes.
         counts: how many of the P candidates each source drew, one after the other.
     """
     score = score if score.dim() == 2 else score.amax(2)
     best = (score == score.amax(1, keepdim=True)).double()
-    best = best / best.sum(1, keepdim=True)
-    return torch.stack([part.sum() for part in best.split(counts, 1)])
+    parts = torch.stack([part.sum(1) for part in best.split(counts, 1)], 1) / best.sum(1, keepdim=True)
+    return parts.masked_fill(best.all(1, keepdim=True), 1 / len(counts)).sum(0)
 
 
 def uniform_plans(share: float, num_plans: int) -> int:

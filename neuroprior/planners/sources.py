@@ -10,7 +10,7 @@ from neuroprior.priors.uniform import UniformPrior
 from neuroprior.sampling.stepping import Steppable, Stepper
 from neuroprior.worlds.world import World
 
-FLOOR = 0.1
+FLOOR = 0.05
 """Each source draws at least this share of the candidates, or half of an equal share where that is less."""
 
 RATE = 0.3
@@ -21,8 +21,9 @@ class Sources:
     """K priors that draw a planner's candidates together, a uniform one always among them.
 
     In each world they begin with equal shares. After each call the share of a source moves towards the share of
-    decisions in which the best candidate was its own. Sources that are equally good keep theirs; one that is better
-    grows to all but the floors; where the world changes, what then finds the best candidates grows again.
+    decisions in which the best candidate was its own. One that is better grows to all but the floors. Where the world
+    changes, what then finds the best candidates grows again.
+    Where all candidates are equally good, shares become equal.
 
     Args:
         priors: of the same number of actions. A uniform prior is added where there is none.
