@@ -366,7 +366,12 @@ class Prior(SavedModule):
         self.check_context_of(context, batch_size)
 
     def check_step(self, action: Tensor, context: Tensor | None) -> None:
-        """Raise ValueError unless `step` can be given these; implementations of `step` begin with it."""
+        """Raise ValueError unless `step` can be given these; implementations of `step` begin with it.
+
+        Not on a GPU, where each look at a value waits for the device.
+        """
+        if action.device.type != "cpu":
+            return
         check_range("action", action, self.num_actions, "actions")
         if context is not None:
             self.check_context_of(context, len(action))

@@ -71,6 +71,6 @@ def as_context(observation: Observation, observed: Tensor, num_states: int) -> T
         got = f"{observed.dtype} {list(observed.shape)}" if isinstance(observed, Tensor) else type(observed).__name__
         kind = "integers of shape " if discrete else ""
         raise ValueError(f"`observe` must give {kind}{shape}, as the world declares {observation}, got {got}")
-    if isinstance(observation, Categories):
+    if isinstance(observation, Categories) and observed.device.type == "cpu":  # a GPU would be waited for
         check_range("observe", observed, observation.number, "categories")
     return observed if discrete or observed.is_floating_point() else observed.to(torch.get_default_dtype())
