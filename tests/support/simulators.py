@@ -139,3 +139,14 @@ class NoisyByModule(NoisySteps):
 
     def step(self, action):
         return NoisyStart.step(self, 1 - action if random.random() < 0.3 else action)
+
+
+SIGMAS = 5
+"""Standard errors by which two means may differ: by chance more with a probability of 6e-7."""
+
+
+def means_agree(first, second):
+    """Whether two samples may have the same mean, up to `SIGMAS` standard errors."""
+    first, second = (np.asarray(x, dtype=float) for x in (first, second))
+    error = np.sqrt(first.var() / len(first) + second.var() / len(second))
+    return abs(first.mean() - second.mean()) <= SIGMAS * error

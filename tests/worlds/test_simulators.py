@@ -15,10 +15,8 @@ from neuroprior.worlds.simulators.copies import CloneCopier, DeepCopier, PickleC
 from neuroprior.worlds.simulators.fingerprints import digest
 from neuroprior.worlds.simulators.generators import state_of_generators
 from tests.support import environments, simulators
+from tests.support.simulators import SIGMAS, means_agree
 from tests.support.sources import every_plan, refuses, seeded
-
-SIGMAS = 5
-"""A mean of many independent draws is further off than that with a probability of 6e-7."""
 
 
 def bare_rewards(simulator, plan):
@@ -43,13 +41,6 @@ def reach_probability(up, steps, goal=3):
         reached += after.pop(goal, 0.0)
         chance = after
     return reached
-
-
-def means_agree(first, second):
-    """Whether two samples may have the same mean, up to `SIGMAS` standard errors."""
-    first, second = (np.asarray(x, dtype=float) for x in (first, second))
-    error = np.sqrt(first.var() / len(first) + second.var() / len(second))
-    return abs(first.mean() - second.mean()) <= SIGMAS * error
 
 
 def test_a_deterministic_rollout_is_a_bare_replay():
