@@ -9,11 +9,11 @@ from typing import Literal, NamedTuple, Self, TypedDict, Unpack
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_flags, check_memory, check_sizes, is_number, kind_of
+from neuroprior._checks import check_flags, check_memory, check_sizes, kind_of
 from neuroprior._random import generator_on
 from neuroprior.sampling.draws import check_temperature
 from neuroprior.sampling.stepping import Steppable, Stepper, check_in_world
-from neuroprior.worlds.world import Rollout, World
+from neuroprior.worlds.world import Rollout, World, check_objective
 
 STEPS_CACHED = 2**19
 """Simulator steps whose results stay in a CPU's cache."""
@@ -286,16 +286,6 @@ def settle_objective(
         discount = world.discount if settled == "return" else 1.0
     check_objective(settled, discount)
     return settled, discount
-
-
-def check_objective(objective: str | None, discount: float | None) -> None:
-    """Raise ValueError for an unknown `objective`, or a `discount` that is out of range or has no effect."""
-    if objective not in (None, "terminal", "return"):
-        raise ValueError(f'`objective` must be "terminal" or "return", got {objective!r}')
-    if discount is not None and (not is_number(discount) or not 0 < discount <= 1):
-        raise ValueError(f"`discount` must be a number above 0 and at most 1, got {discount!r}")
-    if objective == "terminal" and discount not in (None, 1):
-        raise ValueError('discount: it has no effect with objective="terminal"; use objective="return"')
 
 
 def random_best(score: Tensor, generator: torch.Generator, allowed: Tensor | None = None) -> Tensor:

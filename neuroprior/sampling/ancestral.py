@@ -356,6 +356,8 @@ def _sample_masked(
     logits, state = logits[row], select_rows(state, row)
     for t in range(length):
         allowed = _allowed(mask, plans, t, draw.num_actions).to(logits.device)
+        if not allowed.any(-1).all():
+            raise ValueError(f"`mask` must allow an action in each plan, got none at step {t}")
         plans[:, t] = draw.actions(logits.masked_fill(~allowed, -torch.inf))
         if t + 1 < length:
             given = None if context is None else context[:, t + 1]

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple, Self, TypeVar
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_range, kind_of
+from neuroprior._checks import check_range, is_number, kind_of
 from neuroprior.worlds.observations import Observation, as_context
 
 
@@ -241,3 +241,13 @@ def check_plans(plans: Tensor, batch_size: int, num_actions: int) -> None:
             " (for one plan per start, use plans[:, None])"
         )
     check_range("plans", plans, num_actions, "actions")
+
+
+def check_objective(objective: str | None, discount: float | None) -> None:
+    """Raise ValueError for an unknown `objective`, or a `discount` that is out of range or has no effect."""
+    if objective not in (None, "terminal", "return"):
+        raise ValueError(f'`objective` must be "terminal" or "return", got {objective!r}')
+    if discount is not None and (not is_number(discount) or not 0 < discount <= 1):
+        raise ValueError(f"`discount` must be a number above 0 and at most 1, got {discount!r}")
+    if objective == "terminal" and discount not in (None, 1):
+        raise ValueError('discount: it has no effect with objective="terminal"; use objective="return"')

@@ -125,7 +125,7 @@ def test_what_is_no_mask_or_state_is_refused():
         chain.sample(3, 2, mask=torch.ones(3, 4, dtype=torch.bool))
     with refuses("mask", "must return bool [3, 4], got torch.bool [4]"):
         chain.sample(3, 2, mask=lambda plans: torch.ones(4, dtype=torch.bool))
-    with refuses("legal actions"):
+    with refuses("`mask` must allow an action in each plan"):
         chain.sample(3, 2, mask=torch.zeros(4, dtype=torch.bool))
     with refuses("state", "of 1 row or of num_plans = 3"):
         chain.sample(3, 2, state=state)

@@ -150,3 +150,56 @@ def means_agree(first, second):
     first, second = (np.asarray(x, dtype=float) for x in (first, second))
     error = np.sqrt(first.var() / len(first) + second.var() / len(second))
     return abs(first.mean() - second.mean()) <= SIGMAS * error
+
+
+class ReusedReward:
+    """Returns the same array as reward after each step, with another value."""
+
+    def __init__(self):
+        self.place, self.reward = 0, np.zeros(())
+
+    def step(self, action):
+        self.place += 2 * action - 1
+        self.reward[...] = self.place
+        return None, self.reward, False
+
+
+class ReusedObservation:
+    """Observes the same array after each step, with another value."""
+
+    def __init__(self):
+        self.seen = np.zeros(1, np.float32)
+
+    def step(self, action):
+        self.seen[0] += 2 * action - 1
+        return self.seen, 0.0, False
+
+
+class GoalOutsideState:
+    """Its goal is no part of what `get_state` returns, and differs from one to another."""
+
+    def __init__(self, goal):
+        self.goal, self.place = goal, 0
+
+    def get_state(self):
+        return self.place
+
+    def set_state(self, place):
+        self.place = place
+
+    def step(self, action):
+        self.place += 2 * action - 1
+        return None, float(self.place == self.goal), self.place == self.goal
+
+
+class Views:
+    """Two arrays that are one: copies by pickle lose that."""
+
+    def __init__(self):
+        self.board, self.time = np.zeros(40), 0
+        self.grid = self.board.reshape(8, 5)
+
+    def step(self, action):
+        self.board[self.time] = action + 1
+        self.time += 1
+        return None, float(self.grid.sum() if action == 0 else 0.5), self.time == 40

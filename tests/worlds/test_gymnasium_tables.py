@@ -203,3 +203,13 @@ def test_lava_and_holes_are_no_goals():
     states = torch.arange(16)
     assert world.solved(states).nonzero().flatten().tolist() == [15]
     assert world.terminated(states).sum() == 5
+
+
+def test_a_class_of_one_s_own_is_not_read_by_the_table_of_its_parent():
+    class Cold(gymnasium.envs.toy_text.frozen_lake.FrozenLakeEnv):
+        def step(self, action):
+            observation, reward, *rest = super().step(action)
+            return observation, reward - 1, *rest
+
+    world = from_gymnasium(Cold(is_slippery=False), progress=False)
+    assert world.rollout(world.reset(1), torch.tensor([[[2, 2, 1, 1]]])).rewards.flatten().tolist() == [-1.0] * 4

@@ -448,3 +448,36 @@ def test_simulators_are_stepped_on_the_cpu():
         world.to("cuda")
     with refuses("`observe` must be given to from_simulator"):
         world.observe(world.reset(1))
+
+
+def test_arrays_that_a_simulator_reuses_are_read_at_once():
+    plan = torch.tensor([[[1, 1, 1, 0, 0]]])
+    world = from_simulator(simulators.ReusedReward(), 2)
+    assert world.rollout(world.reset(1), plan).rewards.flatten().tolist() == [1, 2, 3, 2, 1]
+    for observe in ("observation", lambda simulator: simulator.seen):
+        world = from_simulator(simulators.ReusedObservation(), 2, observe=observe, observation=Features(1))
+        states = world.rollout(world.state_of(simulators.ReusedObservation(), np.zeros(1)), plan, None, True).states
+        assert world.observe(states[0, 0]).flatten().tolist() == [1, 2, 3, 2, 1]
+
+
+def test_what_a_state_leaves_out_is_each_simulator_s_own():
+    world = from_simulator([simulators.GoalOutsideState(2), simulators.GoalOutsideState(-2)], 2)
+    other = world.state_of(simulators.GoalOutsideState(-2))
+    plans = torch.tensor([[[0, 0], [1, 1]]])
+    rewards = world.rollout(torch.cat([torch.tensor([0, 1]), other]), plans.expand(3, 2, 2)).rewards.sum(-1)
+    assert rewards.tolist() == [[0, 1], [1, 0], [1, 0]]
+
+
+def test_starts_that_are_made_again_are_no_noise():
+    """A function's simulators are deterministic, and stay so."""
+    world = from_simulator(simulators.Walk, 2)
+    for seed in range(3):
+        state = world.reset(2, seeded(seed))
+        assert SamplingPlanner(UniformPrior(2), 5, 64).plan(world, state, seeded(seed)).score.tolist() == [1.0, 1.0]
+        assert not world.stochastic
+
+
+def test_copies_that_lose_what_a_simulator_is_are_not_used():
+    world = from_simulator(simulators.Views, 2)
+    rewards = world.rollout(world.reset(1), torch.tensor([[[1, 1, 1, 0]]])).rewards
+    assert rewards.flatten().tolist() == [0.5, 0.5, 0.5, 7.0]

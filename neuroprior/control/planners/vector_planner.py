@@ -12,7 +12,8 @@ from neuroprior._random import generator_on
 from neuroprior.control.planners.shares import Shares
 from neuroprior.control.priors.vector_prior import VectorPrior
 from neuroprior.control.worlds.continuous_world import ContinuousWorld, check_is_continuous
-from neuroprior.planners.planner import check_objective, value_of
+from neuroprior.planners.planner import value_of
+from neuroprior.worlds.world import check_objective
 
 
 class Memory(NamedTuple):

@@ -30,6 +30,14 @@ def has_table(env: Any) -> bool:
     return isinstance(getattr(base, "P", None), dict) and hasattr(base, "initial_state_distrib") and env is base
 
 
+def overrides_step(env: Any) -> bool:
+    """Whether a class of the user's steps otherwise than the toy text of Gymnasium that it inherits a table from."""
+    kinds = type(env).__mro__
+    own = next(kind for kind in kinds if "step" in vars(kind))
+    inherits = any(kind.__module__.startswith("gymnasium.envs") for kind in kinds)
+    return inherits and not own.__module__.startswith("gymnasium.")
+
+
 def read_table(env: Any) -> EpisodicWorld:
     """The table of a toy text; see `from_gymnasium`.
 

@@ -14,7 +14,7 @@ from neuroprior.worlds.gymnasium.environment import (
     open_environment,
     without_limits,
 )
-from neuroprior.worlds.gymnasium.tables import enumerate_states, has_table, read_table
+from neuroprior.worlds.gymnasium.tables import enumerate_states, has_table, overrides_step, read_table
 from neuroprior.worlds.observations import Features
 from neuroprior.worlds.simulators.building import from_simulator
 from neuroprior.worlds.simulators.driver import FromStep
@@ -104,7 +104,7 @@ def from_gymnasium(
     if not chosen or any(not isinstance(one, int | np.integer) or one < 0 for one in chosen):
         raise ValueError(f"`seeds` must be one or more integers that are not negative, got {chosen}")
     opened, make = open_environment(env, make_options)
-    if method == "auto" and has_table(opened):
+    if method == "auto" and has_table(opened) and not overrides_step(opened):
         method = "table"
     if method == "table" and seeds is not None:
         raise ValueError('seeds: a table read from P has one layout; use method="enumerate"')

@@ -19,8 +19,9 @@ from neuroprior.worlds.simulators.copies import (
 from neuroprior.worlds.simulators.driver import Driver, make_simulator
 from neuroprior.worlds.simulators.fingerprints import fingerprint
 from neuroprior.worlds.simulators.generators import keep_global_generators, seed_generators
-from neuroprior.worlds.simulators.trials import Noise, require_same_starts, try_out
+from neuroprior.worlds.simulators.trials import Noise, require_as_original, require_same_starts, try_out
 from neuroprior.worlds.simulators.world import SimulatorWorld, enter, make_start
+from neuroprior.worlds.world import check_objective
 
 
 def from_simulator(
@@ -88,6 +89,7 @@ def from_simulator(
     """
     if workers is not None:
         check_sizes(workers=workers)
+    check_objective(objective, discount)
     if (observe is None) != (observation is None):
         raise ValueError("`observe` and `observation` must be given together: what is observed, and what it is")
     with keep_global_generators():
@@ -111,6 +113,8 @@ def from_simulator(
                         driver, copier, starts[0], make_start(driver, copier, make, (seeds or (seed,))[0])
                     )
                 noise = try_out(driver, copier, starts, seed, stochastic is None)
+                if make is not None and not noise.draws:
+                    require_as_original(driver, copier, starts[0], make((seeds or (seed,))[0])[0])
             except Exception as error:  # a simulator may fail to be copied in any way of its own
                 problem = error
                 continue

@@ -209,10 +209,10 @@ class CloneCopier(Copier):
 
 
 class StateCopier(Copier):
-    """Copies by the methods `get_state` and `set_state`: one simulator is set to each state.
+    """Copies by the methods `get_state` and `set_state`: of each start one simulator is set to all states.
 
     Args:
-        host: the simulator that is set.
+        host: the simulator that is set, where one that is entered cannot be copied.
         deep: also copy the states, for those that go on to change with the simulator.
     """
 
@@ -221,18 +221,23 @@ class StateCopier(Copier):
         create_lazy_generators(host)
 
     def enter(self, simulator: Any, seed: int) -> Any:
-        state = (copy.deepcopy(simulator.get_state()),)
-        self._paths = list(find_generators(self.load(state)))
-        return state
+        try:  # what is not part of the state may differ from one simulator to another
+            host = copy.deepcopy(simulator)
+            create_lazy_generators(host)
+        except Exception:
+            host = self._host
+        saved = copy.deepcopy(simulator.get_state()), host
+        self._paths = list(find_generators(self.load(saved)))
+        return saved
 
     def save(self, simulator: Any, origin: tuple[Any, list[int], int]) -> Any:
         state = simulator.get_state()
-        return (copy.deepcopy(state) if self._deep else state,)  # a tuple, which is never None
+        return copy.deepcopy(state) if self._deep else state, origin[0][1]
 
     def load(self, saved: Any) -> Any:
-        (state,) = saved
-        self._host.set_state(copy.deepcopy(state) if self._deep else state)
-        return self._host
+        state, host = saved
+        host.set_state(copy.deepcopy(state) if self._deep else state)
+        return host
 
     def generators(self, simulator: Any) -> list[Any]:
         return _at_paths(simulator, self._paths)

@@ -129,9 +129,12 @@ class Driver:
         elif isinstance(info, dict):
             mask = info.get("action_mask")
         if mask is not None:
-            mask = np.asarray(mask).astype(bool)
+            mask = np.asarray(mask)
             if mask.shape != (self.num_actions,):
                 raise ValueError(f"`legal_actions` must be bool [{self.num_actions}], got {list(mask.shape)}")
+            if not np.isin(mask, (0, 1)).all():
+                raise ValueError(f"`legal_actions` must be True or False for each action, got {mask.tolist()}")
+            mask = mask.astype(bool)
         if self.observe is None:
             return View(None, mask)
         if isinstance(self.observe, FromStep):
@@ -154,7 +157,7 @@ class Driver:
                 raise ValueError(f"`observe` must return an integer from 0 to {number - 1}, got {value!r}")
             return int(value)
         assert self.observation is not None
-        features, size = np.atleast_1d(np.asarray(value, dtype=np.float32)), self.observation.size
+        features, size = np.atleast_1d(np.array(value, dtype=np.float32)), self.observation.size
         if features.shape != (size,):
             raise ValueError(f"`observe` must return {size} numbers, got the shape {list(features.shape)}")
         return features
@@ -190,7 +193,7 @@ class Driver:
         step, first, rewards, ended = simulator.step, self.first_action, list[float](), False
         for action in actions:
             result = step(action + first)
-            rewards.append(result[1])
+            rewards.append(float(result[1]))  # now: a simulator may return the same array again
             if result[2] or (len(result) == 5 and result[3]):
                 ended = True
                 break

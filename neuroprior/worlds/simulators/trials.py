@@ -104,6 +104,13 @@ def require_same_starts(driver: Driver, copier: Copier, first: Start, second: St
     _require_equal(moments, again, SEEDED)
 
 
+def require_as_original(driver: Driver, copier: Copier, start: Start, original: Any) -> None:
+    """Raise ValueError unless a simulator, which is stepped itself, behaves as copies of one that was made alike."""
+    moments, _ = random_walk(driver, copier.load(start.saved), start.view, WALK_LENGTH, np.random.default_rng(0))
+    whole, _ = follow_on(driver, original, start.view, _actions(moments))
+    _require_equal(moments, whole, "have copies that behave as it does")
+
+
 def _actions(moments: Sequence[Moment]) -> list[int]:
     return [moment.action for moment in moments]
 

@@ -349,7 +349,8 @@ class SimulatorWorld(World):
             if seed is not None:
                 if seed < 0 or self._make is None:
                     raise ValueError("`state` must be one that is kept, got one from before `forget` was called")
-                start = make_start(self.driver, self.copier, self._make, seed)
+                with keep_global_generators():  # what a start draws is no noise of the steps
+                    start = make_start(self.driver, self.copier, self._make, seed)
                 self._snapshots.put(at, start.saved)
                 self._views.put(at, start.view)
                 continue
