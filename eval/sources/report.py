@@ -1,11 +1,12 @@
 """The report of `python -m eval sources`: scores of each source of candidates alone and of all together."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import pandas as pd
 
-from eval.sources.run import ALL, LATE, SOURCES
+from eval.sources.run import PARTS, SOURCES
 from eval.worlds import runs
 from neuroprior.behaviour.report.document import Column, Document, table
 from neuroprior.behaviour.report.page import Section, Table
@@ -15,65 +16,63 @@ PLACE = ["part", "world", "plans"]
 
 def sources_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], command: str) -> Document:
     """The tables of the results of `run_sources`: of all calls, and of their second half."""
-    notes = [f"{one['world']}, seed {one['seed']}: left out, {one['note']}." for one in results if one["note"]]
-    frame = runs.frame_of(results)
-    if frame.empty:
-        return Document("Sources of candidates", " ".join(notes), [Section("Scores")], {}, settings, command)
-    rows = source_rows(frame)
-    parts = [rows[rows["part"] == part] for part in (ALL, LATE)]
-    sections = [Section("Scores", tables=[source_table(part) for part in parts])]
-    lead = " ".join([*map(finding, parts), *notes])
-    return Document("Sources of candidates", lead, sections, {"rows": rows, "scores": frame}, settings, command)
+    words = [f"{one['world']}, seed {one['seed']}: left out, {one['note']}." for one in results if one["note"]]
+    frames, tables = {}, []
+    if any(one["entries"] for one in results):
+        frame = runs.frame_of(results)
+        rows = source_rows(frame)
+        parts = [rows[rows["part"] == part] for part in PARTS]
+        frames, tables, words = (
+            {"rows": rows, "scores": frame},
+            [*map(source_table, parts)],
+            [*map(finding, parts), *words],
+        )
+    sections = [Section("Scores", tables=tables)]
+    return Document("Sources of candidates", " ".join(words), sections, frames, settings, command)
 
 
 def source_rows(frame: pd.DataFrame) -> pd.DataFrame:
     """A row a part, world and number of plans: mean scores, and how much higher `shared` is, with intervals.
 
-    `over_best`: than the source with the highest mean over seeds, whose name is `best`; `over_uniform`.
+    `over_best`: than the source that has the highest mean over seeds; `over_uniform`.
     """
-    best = frame.groupby(PLACE)[list(SOURCES)].transform("mean").idxmax(axis=1)
-    highest = [row[name] for (_, row), name in zip(frame.iterrows(), best, strict=True)]
-    frame = frame.assign(
-        best=best, over_best=frame["shared"] - highest, over_uniform=frame["shared"] - frame["uniform"]
-    )
-    rows = frame.groupby(PLACE, sort=False)["best"].first().reset_index()
-    rows = rows.merge(runs.seed_means(frame, PLACE, "shared", ["learned", *SOURCES]).drop(columns=["low", "high"]))
-    for gap in ("over_best", "over_uniform"):
-        ends = {"low": f"{gap}_low", "high": f"{gap}_high"}
-        rows = rows.merge(runs.seed_means(frame, PLACE, gap).rename(columns=ends).drop(columns="seeds"))
-    return rows
+    scores = frame[list(SOURCES)]
+    means = frame.groupby(PLACE)[list(SOURCES)].transform("mean")
+    best = scores.where(means.eq(means.max(axis=1), axis=0)).mean(axis=1)
+    frame = frame.assign(over_best=frame["shared"] - best, over_uniform=frame["shared"] - frame["uniform"])
+    rows = runs.seed_means(frame, PLACE, "over_best", ["learned", *SOURCES, "shared"])
+    rows = rows.rename(columns={"low": "over_best_low", "high": "over_best_high"})
+    uniform = runs.seed_means(frame, PLACE, "over_uniform")
+    uniform = uniform.rename(columns={"low": "over_uniform_low", "high": "over_uniform_high"})
+    return rows.merge(uniform.drop(columns="seeds"), on=PLACE)
 
 
 def source_table(rows: pd.DataFrame) -> Table:
     """Scores in one part of the calls, a row a world and number of plans."""
 
     def number(row: Any) -> str:
-        return f"{row['plans']}" if row["learned"] == row["plans"] else f"{row['plans']} ({row['learned']:.0f})"
+        return f"{row['plans']}" + f" ({row['learned']:.0f})" * (row["learned"] < row["plans"])
 
-    def score(name: str) -> Column:
-        return lambda row: f"{100 * row[name]:.1f}"
-
-    def gap(name: str) -> Column:
-        return lambda row: runs.plus_minus(row, name, 100, sign="+", ends=f"{name}_")
-
+    percent = 100 * rows[[*SOURCES, "shared"]]
     columns: dict[str, Column] = {"world": "world", "plans": number}
-    columns |= {name: score(name) for name in (*SOURCES, "shared")}
-    columns |= {"- best": gap("over_best"), "- uniform": gap("over_uniform")}
+    columns |= {name: f"{name}:.1f" for name in (*SOURCES, "shared")}
+    for gap, heading in (("over_best", "- best"), ("over_uniform", "- uniform")):
+        columns[heading] = partial(runs.plus_minus, name=gap, factor=100, sign="+", ends=f"{gap}_")
     caption = (
-        "Scores in %: 0: random plans, 100: the optimum, or the best that any reached. In brackets: plans that were"
-        " collected where they are fewer than asked for. - best: shared minus the source of the highest mean score."
+        "Scores, %: 0: random plans, 100: the optimum, or the best that any reached. In brackets: how many plans were"
+        " collected where they were fewer. - best: shared minus the source of the highest mean."
         f" {runs.over_seeds(rows)}"
     )
-    return table(rows, columns, caption, f"Candidates by source: {rows['part'].iloc[0]}", "l" + "r" * 8)
+    return table(
+        rows.assign(**percent), columns, caption, f"Candidates by source: {rows['part'].iloc[0]}", "l" + "r" * 8
+    )
 
 
 def finding(rows: pd.DataFrame) -> str:
     """How often sources together are behind, and how far, in one sentence."""
-    lowest, uniform = rows.loc[rows["over_best"].idxmin()], rows["over_uniform"]
-    return (
-        f"{rows['part'].iloc[0].capitalize()}: shared minus the best source is {100 * rows['over_best'].mean():+.1f}"
-        f" points in the mean of {len(rows)} settings, at least {100 * lowest['over_best']:+.1f} ({lowest['world']},"
-        f" {lowest['plans']} plans), its 95 % interval below 0 in {(rows['over_best_high'] < 0).sum()}; shared minus"
-        f" uniform is at least {100 * uniform.min():+.1f}, its interval below 0 in"
-        f" {(rows['over_uniform_high'] < 0).sum()}."
-    )
+    says = [
+        f"{100 * rows[gap].mean():+.1f} points minus {other} (lowest {100 * rows[gap].min():+.1f}; 95 % interval below"
+        f" 0 in {(rows[f'{gap}_high'] < 0).sum()}, above 0 in {(rows[f'{gap}_low'] > 0).sum()})"
+        for gap, other in (("over_best", "the best source"), ("over_uniform", "uniform"))
+    ]
+    return f"{rows['part'].iloc[0].capitalize()}, mean of {len(rows)} settings: shared {', '.join(says)}."

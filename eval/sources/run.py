@@ -10,48 +10,34 @@ from torch import Tensor
 
 from eval.worlds.runs import Run
 from neuroprior._random import draw_seed
+from neuroprior.comparison import trial
 from neuroprior.comparison.contestants import fit_prior
-from neuroprior.comparison.trial import (
-    RANDOM_PLANS,
-    Design,
-    draw_starts,
-    optimum,
-    random_scores,
-    training_plans,
-    true_scores,
-)
 from neuroprior.planners import SamplingPlanner
 from neuroprior.priors import UniformPrior
 from neuroprior.sampling import Steppable
-from neuroprior.worlds import World, cube, four_rooms, from_gymnasium, gridworld, maze
+from neuroprior.worlds import cube, four_rooms, from_gymnasium, gridworld, maze
 
-LEARNED = ("combined", "gru", "markov")
 SOURCES = ("uniform", "markov", "gru", "combined")
 """Of candidates, each alone; together they are "shared"."""
 
-ALL, LATE = "all calls", "second half of the calls"
-
-NUM_ROLLOUTS = 8
-"""Rollouts of each candidate in stochastic worlds."""
+PARTS = ("all calls", "second half of the calls")
 
 STARTS_PER_PLAN = 4
 """Plans are collected from so many times as many starts, since only those better than random are learned from."""
 
-TRAINING_BUDGET = 256
-
-gymnasium = partial(from_gymnasium, starts="any", progress=False)
+gymnasium = partial(from_gymnasium, progress=False)
 WORLDS = {
     "grid": (lambda seed: gridworld(20, 20, "torus", num_worlds=20, seed=seed), 10),
     "four_rooms": (lambda seed: four_rooms(num_layouts=3, seed=seed), 10),
     "maze": (lambda seed: maze(13, 13, num_layouts=3, seed=seed), 10),
     "cube": (lambda seed: cube(scramble=6, reward="distance"), 6),
-    "taxi": (lambda seed: from_gymnasium("Taxi-v4", progress=False), 10),
-    "cliff": (lambda seed: gymnasium("CliffWalking-v1"), 10),
-    "frozen_lake": (lambda seed: gymnasium("FrozenLake-v1", is_slippery=False), 8),
-    "slippery": (lambda seed: gymnasium("FrozenLake-v1", is_slippery=True), 8),
-    "door_key": (lambda seed: gymnasium("MiniGrid-DoorKey-5x5-v0", seeds=range(8)), 12),
-    "key_corridor": (lambda seed: gymnasium("MiniGrid-KeyCorridorS3R1-v0", seeds=range(4)), 12),
-    "cart_pole": (lambda seed: from_gymnasium("CartPole-v1", seeds=range(40), progress=False), 12),
+    "taxi": (lambda seed: gymnasium("Taxi-v4"), 10),
+    "cliff": (lambda seed: gymnasium("CliffWalking-v1", starts="any"), 10),
+    "frozen_lake": (lambda seed: gymnasium("FrozenLake-v1", is_slippery=False, starts="any"), 8),
+    "slippery": (lambda seed: gymnasium("FrozenLake-v1", is_slippery=True, starts="any"), 8),
+    "door_key": (lambda seed: gymnasium("MiniGrid-DoorKey-5x5-v0", seeds=range(8), starts="any"), 12),
+    "key_corridor": (lambda seed: gymnasium("MiniGrid-KeyCorridorS3R1-v0", seeds=range(4), starts="any"), 12),
+    "cart_pole": (lambda seed: gymnasium("CartPole-v1", seeds=range(40)), 12),
 }
 """By name: a function of a seed that makes the world, and the actions in a plan."""
 
@@ -70,53 +56,43 @@ class SourceSettings:
 def run_sources(run: Run, settings: SourceSettings) -> dict[str, Any]:
     """Fit priors to plans of one world, then decide with each source alone and with all.
 
-    Priors that learn from fewer plans learn from the first of those that others learn from.
+    Where fewer plans are asked for, they are the first of the others.
 
     Returns:
-        `entries`, two of each number of `plans`, by `part` of the calls: how many were `learned` from, and the
-        normalised scores by source; `note`: why there are none, or "".
+        `entries`, one of each number of `plans` and `part` of the calls: how many were `learned` from, and normalised
+        scores by source; `note`: why there are none, or "".
     """
     make, length = WORLDS[run.world]
     world = make(settings.seed * 10_000 + run.seed)
     generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + run.seed)
-    number, training_starts = settings.starts * settings.calls, STARTS_PER_PLAN * max(settings.plans)
-    design = Design(world, None, {}, {}, (settings.num_plans,), length, number, training_starts, TRAINING_BUDGET)
-    training, state, _ = draw_starts(design, generator)
-    collected = training_plans(design, training, generator)
+    numbers = settings.starts * settings.calls, STARTS_PER_PLAN * max(settings.plans)
+    design = trial.Design(world, None, {}, {}, (settings.num_plans,), length, *numbers, training_budget=256)
+    training, state, _ = trial.draw_starts(design, generator)
+    collected = trial.training_plans(design, training, generator)
     if collected is None:
         return run._asdict() | {"entries": [], "note": "too few plans were better than random ones"}
     plan_seed, score_seed = draw_seed(generator), draw_seed(generator)
-    random = random_scores(world, state, length, RANDOM_PLANS, generator, score_seed)
-    decided = partial(decided_scores, world, state, length, settings, plan_seed, score_seed)
-    uniform, best = decided(UniformPrior(world.num_actions)), optimum(world, state, length)
+
+    def scores_with(prior: Steppable | Sequence[Steppable]) -> Tensor:
+        planner = SamplingPlanner(prior, length, settings.num_plans, num_rollouts=8 if world.stochastic else None)
+        drawn = torch.Generator().manual_seed(plan_seed)
+        plans = torch.cat([planner.plan(world, some, drawn).plan for some in state.split(settings.starts)])
+        return trial.true_scores(world, state, plans[:, None], score_seed)[:, 0]
+
+    random = trial.random_scores(world, state, length, trial.RANDOM_PLANS, generator, score_seed)
+    uniform, best = scores_with(UniformPrior(world.num_actions)), trial.optimum(world, state, length)
     entries = []
     for asked in settings.plans:
         plans = collected[:asked]
-        priors = {name: fit_prior(name, plans, world.num_actions, generator) for name in LEARNED}
-        scores = {"uniform": uniform} | {name: decided(prior) for name, prior in priors.items()}
-        scores["shared"] = decided(list(priors.values()))
+        learned = ("combined", "gru", "markov")
+        priors = {name: fit_prior(name, plans, world.num_actions, generator) for name in learned}
+        scores = {"uniform": uniform} | {name: scores_with(prior) for name, prior in priors.items()}
+        scores["shared"] = scores_with(list(priors.values()))
         highest = torch.stack(list(scores.values())).amax(0) if best is None else best.double()
-        for part, first in ((ALL, 0), (LATE, settings.starts * (settings.calls // 2))):
+        for part, first in zip(PARTS, (0, settings.starts * (settings.calls // 2)), strict=True):
             room = float((highest - random)[first:].sum())
             if room <= 0:
                 return run._asdict() | {"entries": [], "note": "no plan is better than random ones"}
             shares = {name: float((score - random)[first:].sum()) / room for name, score in scores.items()}
             entries.append({"plans": asked, "learned": len(plans), "part": part, **shares})
     return run._asdict() | {"entries": entries, "note": ""}
-
-
-def decided_scores(
-    world: World,
-    state: Tensor,
-    length: int,
-    settings: SourceSettings,
-    plan_seed: int,
-    score_seed: int,
-    prior: Steppable | Sequence[Steppable],
-) -> Tensor:
-    """What the plans really get, float64 `[B]`, that a planner decides for in calls of `settings.starts` starts."""
-    num_rollouts = NUM_ROLLOUTS if world.stochastic else None
-    planner = SamplingPlanner(prior, length, settings.num_plans, num_rollouts=num_rollouts)
-    generator = torch.Generator().manual_seed(plan_seed)
-    plans = torch.cat([planner.plan(world, some, generator).plan for some in state.split(settings.starts)])
-    return true_scores(world, state, plans[:, None], score_seed)[:, 0]
