@@ -17,16 +17,14 @@ PLACE = ["part", "world", "plans"]
 def sources_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], command: str) -> Document:
     """The tables of the results of `run_sources`: of all calls, and of their second half."""
     words = [f"{one['world']}, seed {one['seed']}: left out, {one['note']}." for one in results if one["note"]]
-    frames, tables = {}, []
+    frames: dict[str, pd.DataFrame] = {}
+    tables: list[Table] = []
     if any(one["entries"] for one in results):
         frame = runs.frame_of(results)
         rows = source_rows(frame)
         parts = [rows[rows["part"] == part] for part in PARTS]
-        frames, tables, words = (
-            {"rows": rows, "scores": frame},
-            [*map(source_table, parts)],
-            [*map(finding, parts), *words],
-        )
+        frames, tables = {"rows": rows, "scores": frame}, [*map(source_table, parts)]
+        words = [*map(finding, parts), *words]
     sections = [Section("Scores", tables=tables)]
     return Document("Sources of candidates", " ".join(words), sections, frames, settings, command)
 
@@ -51,7 +49,7 @@ def source_table(rows: pd.DataFrame) -> Table:
     """Scores in one part of the calls, a row a world and number of plans."""
 
     def number(row: Any) -> str:
-        return f"{row['plans']}" + f" ({row['learned']:.0f})" * (row["learned"] < row["plans"])
+        return f"{row['plans']} ({row['learned']:.0f})" if row["learned"] < row["plans"] else f"{row['plans']}"
 
     percent = 100 * rows[[*SOURCES, "shared"]]
     columns: dict[str, Column] = {"world": "world", "plans": number}
@@ -63,9 +61,8 @@ def source_table(rows: pd.DataFrame) -> Table:
         " collected where they were fewer. - best: shared minus the source of the highest mean."
         f" {runs.over_seeds(rows)}"
     )
-    return table(
-        rows.assign(**percent), columns, caption, f"Candidates by source: {rows['part'].iloc[0]}", "l" + "r" * 8
-    )
+    title = f"Candidates by source: {rows['part'].iloc[0]}"
+    return table(rows.assign(**percent), columns, caption, title, "l" + "r" * 8)
 
 
 def finding(rows: pd.DataFrame) -> str:

@@ -12,13 +12,22 @@ from eval.sources.report import sources_document
 from eval.sources.run import PARTS, SOURCES, SourceSettings, run_sources
 from eval.worlds.runs import Run
 from neuroprior._statistics import mean_interval
-from neuroprior.priors import UniformPrior
+from neuroprior.comparison.contestants import fit_prior
+from neuroprior.priors import MarkovPrior, UniformPrior
 
 SMALL = ["sources", "--worlds", "grid", "--plans", "20", "30", "--seeds", "2", "--calls", "3", "--starts", "4"]
 SMALL += ["--num-plans", "8", "--processes", "1"]
 
 
-def test_two_small_runs(tmp_path, capsys):
+def test_two_small_runs(tmp_path, capsys, monkeypatch):
+    """The other priors are chains, too: networks take their time."""
+
+    def fitted(name, plans, number, generator):
+        if name == "markov":
+            return fit_prior(name, plans, number, generator)
+        return MarkovPrior(number, {"gru": 0, "combined": 3}[name]).fit(plans.without_context())
+
+    monkeypatch.setattr(sources, "fit_prior", fitted)
     assert main([*SMALL, "--out", str(tmp_path)]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "Candidates by source: second half of the calls" in printed
