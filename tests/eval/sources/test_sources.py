@@ -13,6 +13,7 @@ from eval.sources.run import PARTS, SOURCES, SourceSettings, run_sources
 from eval.worlds.runs import Run
 from neuroprior._statistics import mean_interval
 from neuroprior.comparison.contestants import fit_prior
+from neuroprior.planners import SamplingPlanner
 from neuroprior.priors import MarkovPrior, UniformPrior
 
 SMALL = ["sources", "--worlds", "grid", "--plans", "20", "30", "--seeds", "2", "--calls", "3", "--starts", "4"]
@@ -71,6 +72,22 @@ def test_scores_of_parts(monkeypatch):
 
 def test_without_an_optimum_the_best_that_any_reached_is_one(monkeypatch):
     assert {entry["shared"] for entry in planned(monkeypatch, None)["entries"]} == {1.0}
+
+
+def test_which_planners_decide(monkeypatch):
+    """Each source alone, then the three that learned together; each in three calls of two starts."""
+    calls = []
+
+    class Recorded(SamplingPlanner):
+        def plan(self, world, state, generator=None):
+            number = 1 if self.sources is None else len(self.sources.priors)
+            calls.append((number, self.num_plans, len(state)))
+            return super().plan(world, state, generator)
+
+    monkeypatch.setattr(sources, "SamplingPlanner", Recorded)
+    planned(monkeypatch, None)
+    alone, together = [(1, 8, 2)] * 3, [(3, 8, 2)] * 3  # the fitted ones are uniform here: none is added
+    assert calls == alone + 2 * (3 * alone + together)
 
 
 def test_what_is_left_out(monkeypatch):
