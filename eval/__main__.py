@@ -25,6 +25,7 @@ COMMANDS = {
         "eval.control.command:control_experiment", "priors that propose continuous actions to iCEM, MPPI and shooting"
     ),
     "options": Command("eval.options.command:options", "modes that persist as options of a planner that samples"),
+    "sources": Command("eval.sources.command:sources", "several priors that share a planner's candidates"),
     "intentions": Command(
         "eval.intentions.command:intentions", "what an observed agent is after, by priors toward known goals"
     ),
