@@ -266,6 +266,29 @@ def test_one_start_for_all_episodes_is_said():
         world = from_gymnasium(environments.Layouts(), seed=3)
     assert int((world.starts > 0).sum()) == 1
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.filterwarnings("error", message="env: it starts otherwise")
         from_gymnasium(environments.Layouts(), seeds=[3])
         from_gymnasium(environments.Corridor())
+
+
+def test_rewards_that_depend_on_a_counter_are_said():
+    """Each second step pays: in a table each does, as the first."""
+
+    class Rhythm(gymnasium.Env):
+        action_space, observation_space = gymnasium.spaces.Discrete(2), gymnasium.spaces.Discrete(11)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.cell, self.time = 5, 0
+            return 5, {}
+
+        def step(self, action):
+            self.time += 1
+            self.cell = min(10, max(0, self.cell + 2 * int(action) - 1))
+            return self.cell, float(action == self.time % 2), False, False, {}
+
+    with pytest.warns(UserWarning, match="rewards depend on `time`, which each step changes") as caught:
+        from_gymnasium(Rhythm(), progress=False)
+    assert caught[0].filename == __file__
+    world = from_gymnasium(Rhythm(), method="step", progress=False)
+    assert world.rollout(world.reset(1), torch.tensor([[[1, 0, 0, 1]]])).rewards.flatten().tolist() == [1, 1, 0, 0]

@@ -1,6 +1,7 @@
 """Gymnasium environments as tables: read from their attribute `P`, or enumerated breadth first by copies."""
 
 import hashlib
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
@@ -133,7 +134,18 @@ def enumerate_states(
                 search.add_layout(layout, start, show)
         for layout, start in enumerate(world.starts):
             search.check_walks(layout, start, np.random.default_rng(seed))
+        if search.rewards_differ and not _is_minigrid(world.copier.load(world.starts[0].saved)):
+            warnings.warn(
+                f"env: rewards depend on `{', '.join(counters.names)}`, which each step changes; in this table they are"
+                ' those of a first step (method="step" gives them as they are)',
+                stacklevel=3,
+            )
         return search.table(world.action_names, observations)
+
+
+def _is_minigrid(env: Any) -> bool:
+    """Whether it is one of MiniGrid's environments, whose rewards are known to fall with the number of steps."""
+    return type(env.unwrapped).__module__.startswith("minigrid")
 
 
 class _Search:
@@ -142,6 +154,7 @@ class _Search:
     Attributes:
         next_state, rewards: rows of the table so far.
         layouts, ended, observations, masks: of each state so far.
+        rewards_differ: whether walks found other rewards than those of a first step.
     """
 
     def __init__(self, world: SimulatorWorld, counters: Counters, max_states: int) -> None:
@@ -149,6 +162,7 @@ class _Search:
         self.next_state: list[list[int]] = []
         self.rewards: list[list[float]] = []
         self.layouts: list[int] = []
+        self.rewards_differ = False
         self.ended: list[bool] = []
         self.observations: list[Any] = []
         self.masks: list[np.ndarray[Any, Any]] = []
@@ -275,6 +289,7 @@ class _Search:
                         f"env: action {t} of a walk led to something else than in its table: it is stochastic, or its"
                         ' state is not in its attributes; use method="step"'
                     )
+                self.rewards_differ = self.rewards_differ or reward != expected
                 if ended:
                     break
 
