@@ -69,8 +69,8 @@ class MCTSPlanner(PriorPlanner):
         self.exploration = exploration
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
-        if world.stochastic:
-            raise ValueError("`world` must be deterministic: a node of the tree is one state")
+        reason = "a node of the tree is one state"
+        self._require_deterministic(world, reason)
         planner, generator = self._prepare(world, state, generator)
         from neuroprior.planners import compiled_mcts
 
@@ -79,7 +79,9 @@ class MCTSPlanner(PriorPlanner):
         if not whole:
             numbers = max(numbers, self._state_size(world, state) // PER_ACTION)
         chunks = self.chunks(state, self.num_plans * self.length * numbers)
-        return join_decisions((planner._plan(whole, world, some, generator) for some in chunks), len(state))
+        decision = join_decisions((planner._plan(whole, world, some, generator) for some in chunks), len(state))
+        self._require_deterministic(world, reason)
+        return decision
 
     @torch.no_grad()
     def _state_size(self, world: World, state: Tensor) -> int:

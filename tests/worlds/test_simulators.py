@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from neuroprior import SamplingPlanner, UniformPrior
+from neuroprior import FrontierPlanner, MCTSPlanner, SamplingPlanner, UniformPrior
 from neuroprior.testing import check_world
 from neuroprior.worlds import Categories, Features, SimulatorWorld, from_simulator
 from neuroprior.worlds.simulators.copies import CloneCopier, DeepCopier, PickleCopier, ReplayCopier, StateCopier
@@ -481,3 +481,20 @@ def test_copies_that_lose_what_a_simulator_is_are_not_used():
     world = from_simulator(simulators.Views, 2)
     rewards = world.rollout(world.reset(1), torch.tensor([[[1, 1, 1, 0]]])).rewards
     assert rewards.flatten().tolist() == [0.5, 0.5, 0.5, 7.0]
+
+
+@pytest.mark.parametrize("kind", [FrontierPlanner, MCTSPlanner])
+def test_noise_that_is_met_while_planning_is_refused_by_planners_without_noise(kind):
+    class Late:
+        def __init__(self):
+            self.generator, self.time = np.random.default_rng(0), 0
+
+        def step(self, action):
+            self.time += 1
+            return None, 10.0 * (self.generator.random() < 0.5) * action if self.time > 130 else 0.0, False
+
+    world = from_simulator(Late(), 2)
+    assert not world.stochastic
+    with refuses("must be deterministic"):
+        kind(UniformPrior(2), 140, 4).plan(world, world.reset(1), seeded(0))
+    assert world.stochastic

@@ -88,8 +88,8 @@ def from_gymnasium(
             (the message says what), or an argument is out of range.
 
     Warns:
-        UserWarning: it is enumerated, and rewards depend on a counter of steps, which the table leaves out; or it starts
-            otherwise with another seed, but no `seeds` are given.
+        UserWarning: it is enumerated, and rewards depend on a counter of steps, which the table leaves out; or it
+            starts otherwise with another seed, but no `seeds` are given.
 
     Example:
         >>> world = from_gymnasium("FrozenLake-v1", progress=False)
