@@ -238,6 +238,11 @@ class PriorPlanner(Planner):
         """As `Stepper.threads_for`, but all threads where a value of the user's may be worth them."""
         return nullcontext() if self.value is not None else Stepper(self.prior).threads_for(num_plans)
 
+    def _require_deterministic(self, world: World, reason: str) -> None:
+        """Raise ValueError in a stochastic world; after planning as well, which may have met a simulator's noise."""
+        if world.stochastic:
+            raise ValueError(f"`world` must be deterministic: {reason}")
+
     def _prepare(self, world: World, state: Tensor, generator: torch.Generator | None) -> tuple[Self, torch.Generator]:
         """Returns the planner for the world, and the generator to draw with.
 
