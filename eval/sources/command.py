@@ -1,6 +1,7 @@
 """`python -m eval sources`: several priors that share a planner's candidates, against each of them alone."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Literal, TypeAlias
 
 from jsonargparse.typing import PositiveInt
@@ -8,6 +9,7 @@ from jsonargparse.typing import PositiveInt
 from eval.sources.report import sources_document
 from eval.sources.run import SOURCES, WORLDS, SourceSettings, run_sources
 from eval.worlds import runs
+from neuroprior.behaviour.report.document import write_figures
 from neuroprior.comparison.trial import MIN_LEARNED
 
 SourceWorld: TypeAlias = Literal[tuple(WORLDS)]  # type: ignore[valid-type]
@@ -52,4 +54,7 @@ def sources(
         if given < least:
             raise ValueError(f"`{name}` must be at least {least}, got {given}")
     settings = SourceSettings(tuple(sorted(plans)), calls, starts, num_plans, seed)
-    runs.run_experiment("sources", run_sources, sources_document, settings, worlds, seeds, out, processes, dask)
+    document = runs.run_experiment(
+        "sources", run_sources, sources_document, settings, worlds, seeds, out, processes, dask
+    )
+    write_figures(Path(out), {box.name: box.figure for box in document.sections[0].figures})
