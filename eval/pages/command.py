@@ -18,6 +18,7 @@ HOURS = {
     "mice": "0.7",
     "compare": "10.5",
     "planners": "0.7",
+    "which-planner": "0.3",
     "puzzles": "1+",
     "modes": "0.2+",
     "options": "0.2",
