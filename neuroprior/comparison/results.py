@@ -69,12 +69,12 @@ class Comparison:
 
     @property
     def scale(self) -> str:
-        """What a score of 1 is: "the optimum" or "the best score found"."""
+        """Says what a score of 1 stands for, "the optimum" or "the best score found"."""
         return "the best score found" if self.outcomes[0].best is None else "the optimum"
 
     @property
     def unit(self) -> str:
-        """What intervals are over: "seeds", or "starts" of a single seed."""
+        """Says what intervals are over, "seeds" or the "starts" of a single seed."""
         return "seeds" if len(self.outcomes) > 1 else "starts"
 
     @cached_property
