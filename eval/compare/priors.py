@@ -117,7 +117,7 @@ class ContextMarkov(Prior):
         return self._count(plans, best, settings)
 
     def _count(self, plans: Plans, features: Sequence[int] | None, settings: dict[str, Any]) -> Self:
-        self.fallback.fit(plans, **settings)
+        self.fallback.fit(plans_for(self.fallback, plans), **settings)
         context = plans.context
         assert context is not None
         flat = context.flatten(0, -2) if context.is_floating_point() else context.flatten()
