@@ -13,7 +13,7 @@ from eval.worlds.contexts import ContextIndex
 from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, Prior, TabularWorld, TransformerPrior, World, load
 from neuroprior.behaviour.analysis.comparison import score
 from neuroprior.priors import MacroPrior
-from neuroprior.priors.learning import training_plans
+from neuroprior.priors.learning import plans_for, training_plans
 from neuroprior.priors.matching import numbers
 
 ORDERS = range(5)
