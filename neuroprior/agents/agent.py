@@ -163,8 +163,9 @@ class Agent:
             self.state = self.state.clone()
             self.state[over] = self.world.reset(int(over.sum()), self.generator).to(self.state)
             if self.last is not None:
-                lengths = torch.full_like(over, self.last.plan.shape[1], dtype=torch.long)
-                lengths = lengths if self.last.lengths is None else self.last.lengths
+                lengths = self.last.lengths
+                if lengths is None:
+                    lengths = torch.full_like(over, self.last.plan.shape[1], dtype=torch.long)
                 self.last = self.last._replace(lengths=lengths.masked_fill(over, 0))
         return over
 
@@ -211,8 +212,10 @@ class Agent:
         time = torch.arange(actions.shape[1], device=actions.device)
         episode = begins.flatten().cumsum(0).view(actions.shape) - 1
         inside = alive[row] & (episode[row] == torch.arange(len(row), device=actions.device)[:, None])
-        kept, lengths = (inside * rewards[row]).sum(1), inside.sum(1)
-        kept = (lengths > 0) if self.min_score is None else (lengths > 0) & (kept > self.min_score)
+        lengths, score = inside.sum(1), (inside * rewards[row]).sum(1)
+        kept = lengths > 0
+        if self.min_score is not None:
+            kept &= score > self.min_score
         if not kept.any():
             return
         place = row[kept, None], (first[kept, None] + time).clamp(max=actions.shape[1] - 1)

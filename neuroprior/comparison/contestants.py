@@ -14,6 +14,7 @@ from neuroprior.priors import CombinedPrior, MarkovPrior, Prior, UniformPrior
 from neuroprior.priors.construction import context_arguments
 from neuroprior.priors.ensembles.candidates import best_chain, counting_parts
 from neuroprior.priors.fitting import PRIORS, MakePrior, make_prior, name_of
+from neuroprior.priors.learning import plans_for
 from neuroprior.sampling import Steppable
 from neuroprior.worlds import World
 
@@ -116,8 +117,7 @@ def fit_markov(plans: Plans, generator: torch.Generator) -> MarkovPrior:
     tried = [best_chain(parts, number) for number in dict.fromkeys((None, num_contexts))]
 
     def log_likelihood(chain: MarkovPrior) -> float:
-        scored = held_out if chain.takes_context else held_out.without_context()
-        return float(chain.log_prob(scored).sum())
+        return float(chain.log_prob(plans_for(chain, held_out)).sum())
 
     return max((chain for chain in tried if chain is not None), key=log_likelihood)
 

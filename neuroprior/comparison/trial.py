@@ -110,7 +110,7 @@ def run_seed(
     Args:
         seed: of everything random.
         design: what is compared.
-        report: is told what is done at present.
+        report: a function of what is done at present.
         start_by: do nothing after this time, in seconds since the epoch.
 
     Returns:

@@ -84,18 +84,18 @@ class SamplingPlanner(PriorPlanner):
         if self.sources is not None:
             for prior in self.sources.priors[1:]:
                 check_in_world(prior, world, state)
-        steps, chunks, wins = self.model_steps(world), self.chunks(state, self.model_steps(world)), list[Tensor]()
+        steps, (num_plans, num_rollouts), wins = self.model_steps(world), self.effort(world), list[Tensor]()
 
         def plan_some(some: Tensor) -> Decision:
             plans, score, ends = self.candidates(world, some, generator)
             if self.sources is not None:
-                wins.append(wins_of(score, self.sources.counts(world, self.effort(world)[0])))
+                wins.append(wins_of(score, self.sources.counts(world, num_plans)))
             decision = decide(plans, score, ends, steps, generator, keep=self.keep_candidates)
             if not world.stochastic or plans.shape[1] == 1:
                 return decision
-            return score_anew(self, world, some, decision, self.effort(world)[1], generator)
+            return score_anew(self, world, some, decision, num_rollouts, generator)
 
-        decision = join_decisions(map(plan_some, chunks), len(state))
+        decision = join_decisions(map(plan_some, self.chunks(state, steps)), len(state))
         if self.sources is not None:
             self.sources.learn(world, torch.stack(wins).sum(0))
         return decision

@@ -10,10 +10,10 @@ from neuroprior.priors.uniform import UniformPrior
 from neuroprior.sampling.stepping import Steppable, Stepper
 from neuroprior.worlds.world import World
 
-FLOOR = 0.05
+MIN_SHARE = 0.05
 """Each source draws at least this share of the candidates, or half of an equal share where that is less."""
 
-RATE = 0.3
+LAST_CALL_WEIGHT = 0.3
 """The weight of the last call of `plan` in the shares of the next one; those before count less and less."""
 
 
@@ -89,8 +89,8 @@ class Sources:
         total = float(wins.sum())
         if total == 0:
             return
-        floor = min(FLOOR, 0.5 / len(self.priors))
-        after = (1 - RATE) * self.shares(world) + RATE * wins.double().cpu() / total
+        floor = min(MIN_SHARE, 0.5 / len(self.priors))
+        after = (1 - LAST_CALL_WEIGHT) * self.shares(world) + LAST_CALL_WEIGHT * wins.double().cpu() / total
         after = after.clamp(min=floor)
         spare = after - floor
         self._shares[world] = floor + spare / spare.sum() * (1 - len(self.priors) * floor)

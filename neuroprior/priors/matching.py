@@ -9,6 +9,7 @@ from torch import Tensor
 from neuroprior.plans import Plans
 from neuroprior.plans.columns import listed
 from neuroprior.plans.plans import check_are_plans
+from neuroprior.priors.learning import plans_for
 from neuroprior.priors.prior import Prior, as_actions
 
 
@@ -39,7 +40,7 @@ def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
                 f"{name}: its end symbol is {prior.end} of {prior.num_actions} actions, and that of the plans"
                 f" {plans.end} of {plans.num_actions}; give plans.without_end()"
             )
-        plans = plans if prior.takes_context else plans.without_context()
+        plans = plans_for(prior, plans)
         return plans if prior.past_durations is None else prior.past_durations.added_to(plans)
     known = prior.num_actions - (prior.end is not None)
     if plans.num_actions > known:

@@ -336,8 +336,8 @@ def _begin(stepper: Stepper, num_roots: int, context: Tensor | None, past: Tenso
     logits, state = stepper.start(num_roots, context[:, 0] if context is not None and per_step else context)
     behind = past.shape[-1]
     for t, action in enumerate(past.expand(num_roots, behind).unbind(1)):
-        given = context[:, t + 1] if context is not None and per_step and t + 1 < context.shape[1] else None
-        logits, state = stepper.step(action, state, given, behind - t - 1)
+        current = context[:, t + 1] if context is not None and per_step else None
+        logits, state = stepper.step(action, state, current, behind - t - 1)
     return logits, state
 
 
@@ -360,24 +360,24 @@ def _sample_masked(
             raise ValueError(f"`mask` must allow an action in each plan, got none at step {t}")
         plans[:, t] = draw.actions(logits.masked_fill(~allowed, -torch.inf))
         if t + 1 < length:
-            given = None if context is None else context[:, t + 1]
-            logits, state = stepper.step(plans[:, t], state, given, length - t - 2)
+            current = None if context is None else context[:, t + 1]
+            logits, state = stepper.step(plans[:, t], state, current, length - t - 2)
     return plans.to(draw.dtype)
 
 
 def _allowed(mask: Tensor | Mask, plans: Tensor, step: int, num_actions: int) -> Tensor:
     """Which actions may be drawn next, bool `[A]` or `[N, A]`, in `plans [N, L]` of which `step` actions are drawn."""
     num_plans, length = plans.shape
-    given = torch.as_tensor(mask(plans[:, :step]) if callable(mask) else mask)
+    allowed = torch.as_tensor(mask(plans[:, :step]) if callable(mask) else mask)
     shapes = [[num_actions], [length, num_actions], [num_plans, length, num_actions]]
     if callable(mask):
         shapes = [[num_plans, num_actions]]
-    if given.dtype != torch.bool or list(given.shape) not in shapes:
+    if allowed.dtype != torch.bool or list(allowed.shape) not in shapes:
         due = " or ".join(map(str, shapes))
         raise ValueError(
-            f"`mask` must {'return' if callable(mask) else 'be'} bool {due}, got {given.dtype} {list(given.shape)}"
+            f"`mask` must {'return' if callable(mask) else 'be'} bool {due}, got {allowed.dtype} {list(allowed.shape)}"
         )
-    return given if callable(mask) or given.dim() == 1 else given[..., step, :]
+    return allowed if callable(mask) or allowed.dim() == 1 else allowed[..., step, :]
 
 
 def _sample_from_roots(
@@ -401,8 +401,6 @@ def _sample_from_roots(
         length, draw, method, batch_size: see `sample`.
     """
     total = int(counts.sum())
-    if total == 0 or length == 0:
-        return torch.empty(total, length, dtype=draw.dtype, device=counts.device)
     whole = stepper.draw_plans(state, counts, length, draw) if method == "auto" and context is None else None
     if whole is not None:
         return whole

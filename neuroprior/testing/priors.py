@@ -146,18 +146,18 @@ def _check_refusals(prior: Prior, generator: torch.Generator) -> None:
     _, state = prior.start(3, context)
     for action in (-1, prior.num_actions):
         wrong = torch.full((3,), action, device=prior.device)
-        told = raises(partial(prior.step, wrong, state))
-        require(told, f"step must raise ValueError for action {action}, see `Prior.check_step`")
+        refused = raises(partial(prior.step, wrong, state))
+        require(refused, f"step must raise ValueError for action {action}, see `Prior.check_step`")
     wrong_context = None if prior.takes_context else torch.zeros(3, dtype=torch.long, device=prior.device)
     what = "no context" if prior.takes_context else "a context, of which it takes none"
-    told = raises(partial(prior.start, 3, wrong_context))
-    require(told, f"start must raise ValueError for {what}, see `Prior.check_start`")
+    refused = raises(partial(prior.start, 3, wrong_context))
+    require(refused, f"start must raise ValueError for {what}, see `Prior.check_start`")
     if prior.num_contexts is not None:
         unknown = torch.full((3,), prior.num_contexts, device=prior.device)
         require(raises(partial(prior.start, 3, unknown)), "start must raise ValueError for an unknown context")
         right = torch.zeros(3, dtype=torch.long, device=prior.device)
-        told = raises(partial(prior.step, right, state, unknown))
-        require(told, "step must raise ValueError for an unknown context")
+        refused = raises(partial(prior.step, right, state, unknown))
+        require(refused, "step must raise ValueError for an unknown context")
 
 
 def _has_rows(state: object, num: int) -> bool:

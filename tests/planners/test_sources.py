@@ -7,7 +7,7 @@ from torch import Tensor
 from neuroprior import MarkovPrior, SamplingPlanner, TabularWorld, UniformPrior, World
 from neuroprior.planners import Sources
 from neuroprior.planners.sampling import wins_of
-from neuroprior.planners.sources import FLOOR, RATE
+from neuroprior.planners.sources import LAST_CALL_WEIGHT, MIN_SHARE
 from neuroprior.worlds import Categories
 from tests.support.sources import FALSE_ALARM, p_value, refuses, seeded
 
@@ -41,11 +41,11 @@ def test_shares_move_towards_who_had_the_best_candidate():
     sources, world = Sources([always(0), always(1)]), Coin(0)
     assert sources.shares(world).tolist() == [1 / 3] * 3
     sources.learn(world, torch.tensor([6.0, 2.0, 0.0]))
-    moved = [(1 - RATE) / 3 + RATE * share for share in (0.75, 0.25, 0.0)]
+    moved = [(1 - LAST_CALL_WEIGHT) / 3 + LAST_CALL_WEIGHT * share for share in (0.75, 0.25, 0.0)]
     assert sources.shares(world).tolist() == pytest.approx(moved)
     for _ in range(60):
         sources.learn(world, torch.tensor([8.0, 0.0, 0.0]))
-    assert sources.shares(world).tolist() == pytest.approx([1 - 2 * FLOOR, FLOOR, FLOOR], abs=1e-6)
+    assert sources.shares(world).tolist() == pytest.approx([1 - 2 * MIN_SHARE, MIN_SHARE, MIN_SHARE], abs=1e-6)
     assert sources.shares(Coin(0)).tolist() == [1 / 3] * 3  # another world has shares of its own
     before = sources.shares(world)
     sources.learn(world, torch.zeros(3))
@@ -79,7 +79,7 @@ def test_candidates_come_from_each_source_by_its_share():
     assert (second == 1).all()
     code = (3 * uniform[..., 0] + uniform[..., 1]).flatten()
     assert p_value(code, torch.ones(9)) > FALSE_ALARM
-    moved = [(1 - RATE) * share + RATE / 3 for share in (0.5, 0.2, 0.3)]  # all are equally good
+    moved = [(1 - LAST_CALL_WEIGHT) * share + LAST_CALL_WEIGHT / 3 for share in (0.5, 0.2, 0.3)]  # all are equally good
     assert planner.sources.shares(world).tolist() == pytest.approx(moved)
 
 

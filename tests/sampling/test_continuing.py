@@ -63,16 +63,16 @@ def test_plans_of_one_kept_state_have_its_distribution(name, method):
     plans = prior.sample(20_000, 3, state=state, method=method, generator=seeded(6))
     every = every_plan(4, 3)
     whole = torch.cat([PAST.expand(len(every), -1), every], 1)
-    given = None if context is None else context.expand(len(every), *context.shape[1:])
-    log_probs = prior.action_log_probs(Plans(whole, 4, context=given))[:, len(PAST) :].sum(1)
+    contexts = None if context is None else context.expand(len(every), *context.shape[1:])
+    log_probs = prior.action_log_probs(Plans(whole, 4, context=contexts))[:, len(PAST) :].sum(1)
     assert fits(plans, log_probs.exp(), 4)
 
 
 def masked_log_probs(prior, context, allowed):
     """The log-probabilities of all plans of three actions, where `allowed(plan[:t])` says which may come next."""
     every = every_plan(4, 3)
-    given = None if context is None else context.expand(len(every), *context.shape[1:])
-    [(_, forecasts)] = prior.forecasts(Plans(every, 4, context=given))
+    contexts = None if context is None else context.expand(len(every), *context.shape[1:])
+    [(_, forecasts)] = prior.forecasts(Plans(every, 4, context=contexts))
     total = torch.zeros(len(every))
     for n, plan in enumerate(every.tolist()):
         for t, action in enumerate(plan):
@@ -87,7 +87,7 @@ def test_masked_plans_have_the_distribution_of_what_is_allowed(name):
     """By a mask for all steps, one for each, one for each plan and step, and a function: no action twice running."""
     prior = PRIORS[name]
     context = first_context(prior, 1)
-    given = None if context is None else context.expand(20_000, *context.shape[1:])
+    contexts = None if context is None else context.expand(20_000, *context.shape[1:])
     every_step = torch.tensor([[True, False, True, True], [False, True, True, False], [True, True, True, True]])
 
     def other_than_last(plans):
@@ -102,7 +102,7 @@ def test_masked_plans_have_the_distribution_of_what_is_allowed(name):
         (every_step.expand(20_000, 3, 4), lambda before: every_step[len(before)].tolist()),
         (other_than_last, lambda before: [not before or action != before[-1] for action in range(4)]),
     ):
-        plans = prior.sample(20_000, 3, given, mask=mask, generator=seeded(7))
+        plans = prior.sample(20_000, 3, contexts, mask=mask, generator=seeded(7))
         assert fits(plans, masked_log_probs(prior, context, allowed).exp(), 4)
 
 

@@ -130,9 +130,8 @@ def action_bits(prior: Prior, plans: Plans) -> Tensor:
     if not isinstance(prior, Prior):
         raise ValueError(f"`prior` must be a fitted prior, got {type(prior).__name__}.")
     check_are_plans(plans)
-    given = plans if prior.takes_context else plans.without_context()
     with torch.no_grad():
-        return -prior.action_log_probs(given).double().cpu() / log(2)
+        return -prior.action_log_probs(plans_for(prior, plans)).double().cpu() / log(2)
 
 
 def never_taken(plans: Plans) -> str:

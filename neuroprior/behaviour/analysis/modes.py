@@ -21,6 +21,7 @@ from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors import SwitchingPrior
 from neuroprior.priors.construction import context_arguments
 from neuroprior.priors.fitting import make_prior
+from neuroprior.priors.learning import plans_for
 from neuroprior.priors.scoring import plan_frame
 
 STABLE = 0.7
@@ -205,7 +206,7 @@ def _scored(prior: SwitchingPrior, plans: Plans) -> Plans:
     if not isinstance(prior, SwitchingPrior):
         raise ValueError(f"`prior` must be a SwitchingPrior, got {type(prior).__name__}.")
     check_are_plans(plans)
-    return plans if prior.takes_context else plans.without_context()
+    return plans_for(prior, plans)
 
 
 def mode_plans(prior: SwitchingPrior, plans: Plans) -> Plans:

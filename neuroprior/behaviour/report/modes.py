@@ -28,6 +28,7 @@ from neuroprior.behaviour.report.part import SIGNIFICANT, Part, action_names, p_
 from neuroprior.behaviour.report.scores import Evaluation
 from neuroprior.plans import BLOCKS, Plans, in_parts
 from neuroprior.priors import SwitchingPrior
+from neuroprior.priors.learning import plans_for
 
 MOST_MOTIFS = 3
 """Sequences that are listed of each mode."""
@@ -163,7 +164,7 @@ def _typical(prior: SwitchingPrior, plans: Plans) -> pd.DataFrame:
 
 def _occupancy(prior: SwitchingPrior, plans: Plans) -> pd.DataFrame:
     """The share of each mode in each tenth of the plans, with its interval."""
-    smoothed = prior.posterior(plans if prior.takes_context else plans.without_context()).smoothed.cpu()
+    smoothed = prior.posterior(plans_for(prior, plans)).smoothed.cpu()
     rows = []
     for k, name in enumerate(mode_names(prior.num_modes)):
         parts = by_position(plans, smoothed[..., k], plans.mask()).parts

@@ -370,8 +370,7 @@ def chosen_on(
 
 def _forecasts(experts: Sequence[Prior], plans: Plans) -> Tensor:
     """`[N, L, E, A]`, the log-probabilities of all experts."""
-    plain = plans.without_context()
-    each = [e.forecasts(plans if e.takes_context else plain) for e in experts]
+    each = [e.forecasts(plans_for(e, plans)) for e in experts]
     return torch.stack([torch.cat([log_probs for _, log_probs in parts]) for parts in each], 2)
 
 

@@ -119,8 +119,7 @@ class Counters:
         """What still grows or shrinks with each step of a long walk that avoids the ends of episodes; None: nothing."""
         saved, view, sizes = self._start.saved, self._start.view, list[dict[Path, float]]()
         for step in range(ENDLESS_STEPS):
-            legal = np.arange(self._driver.num_actions) if view.mask is None else np.flatnonzero(view.mask)
-            for action in self._draw.permutation(legal).tolist():
+            for action in self._draw.permutation(self._driver.legal_numbers(view)).tolist():
                 simulator = self._copier.load(saved)
                 moments, after = follow_on(self._driver, simulator, view, [action])
                 if not moments[0].ended:

@@ -141,6 +141,10 @@ class Driver:
             return View(None if observation is None else self.as_declared(observation), mask)
         return View(self._checked(self.observe(simulator)), mask)
 
+    def legal_numbers(self, view: View) -> Array:
+        """The numbers of the actions that are legal, all where that is not known."""
+        return np.arange(self.num_actions) if view.mask is None else np.flatnonzero(view.mask)
+
     def end(self, view: View) -> int:
         """Whether an episode ends where nothing is legal."""
         return TERMINATED if view.mask is not None and not view.mask.any() else RUNNING

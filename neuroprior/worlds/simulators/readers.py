@@ -9,7 +9,7 @@ import numpy as np
 from neuroprior.worlds.simulators.attributes import Path, read, walk
 from neuroprior.worlds.simulators.copies import Copier
 from neuroprior.worlds.simulators.driver import Driver
-from neuroprior.worlds.simulators.trials import NUM_WALKS, WALK_LENGTH, Start, load_seeded
+from neuroprior.worlds.simulators.trials import NUM_WALKS, WALK_LENGTH, Start, load_seeded, random_walk
 
 METHODS = ("_get_obs", "_get_ob", "_get_observation", "_observe", "get_obs", "get_observation", "gen_obs")
 """Methods by which simulators often give their observation."""
@@ -28,12 +28,10 @@ def find_reader(driver: Driver, copier: Copier, start: Start) -> Reader | None:
     for seed in range(NUM_WALKS):
         simulator, view = load_seeded(copier, start.saved, seed), start.view
         for _ in range(WALK_LENGTH):
-            legal = np.arange(driver.num_actions) if view.mask is None else np.flatnonzero(view.mask)
-            observation, _, ended, info = driver.take(simulator, int(draw.choice(legal)))
-            view = driver.view(simulator, observation, info)
+            moments, view = random_walk(driver, simulator, view, 1, draw)
             readers = _candidates(simulator) if readers is None else readers
             readers = [reader for reader in readers if _agrees(reader, simulator, driver, view.observation)]
-            if ended or driver.end(view):
+            if not moments or moments[0].ended:
                 break
     return readers[0] if readers else None
 

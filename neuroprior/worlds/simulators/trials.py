@@ -146,7 +146,7 @@ def random_walk(
     """What a simulator gives for random legal actions, and the last view."""
     moments: list[Moment] = []
     for _ in range(length):
-        legal = np.arange(driver.num_actions) if view.mask is None else np.flatnonzero(view.mask)
+        legal = driver.legal_numbers(view)
         if not len(legal) or (moments and moments[-1].ended):
             break
         moment, view = _moment(driver, simulator, int(draw.choice(legal)))
