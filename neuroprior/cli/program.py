@@ -13,6 +13,8 @@ from typing import Any, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 from neuroprior._interrupts import ending_at_interrupts
 from neuroprior._version import __version__
+from neuroprior.behaviour.reading import Options
+from neuroprior.cli.reading import add_reading_arguments, pop_reading
 
 LONGEST_MESSAGE = 1000
 """Characters of an error at most: parsers may quote a whole file."""
@@ -90,8 +92,17 @@ def call(function: Callable[..., Any], program: str, arguments: Sequence[str]) -
     Raises:
         argparse.ArgumentError: an argument is not known or not of its type.
     """
-    settings = make_parser(function, program).parse_args(list(arguments))
-    return function(**{name: _plain(value) for name, value in settings.as_dict().items()})
+    parser, reading = make_parser(function, program), _reading_of(function)
+    if reading is not None:
+        add_reading_arguments(parser)
+    settings = parser.parse_args(list(arguments)).as_dict()
+    options = {} if reading is None else {reading: pop_reading(settings)}
+    return function(**{name: _plain(value) for name, value in settings.items()}, **options)
+
+
+def _reading_of(function: Callable[..., Any]) -> str | None:
+    """Return the parameter that says how recordings are read; its options are those of `Options`."""
+    return next((name for name, hint in get_type_hints(function).items() if hint is Options), None)
 
 
 def make_parser(function: Callable[..., Any], program: str, skip: Collection[str] = ()) -> Any:
@@ -113,9 +124,13 @@ def make_parser(function: Callable[..., Any], program: str, skip: Collection[str
     about = f"{described.short_description or ''} Options may be written with hyphens for underscores."
     parser = ArgumentParser(prog=program, description=about, exit_on_error=False, allow_abbrev=True)
     items = {name: item for name, hint in get_type_hints(function).items() if (item := _item_of(hint)) is not None}
-    parser.add_function_arguments(function, as_group=False, as_positional=True, skip={*items, *skip})
+    reading = {_reading_of(function)} - {None}
+    parser.add_function_arguments(function, as_group=False, as_positional=True, skip={*items, *skip, *reading})
     for name, item in items.items():
         default = inspect.signature(function).parameters[name].default
+        if default is inspect.Parameter.empty:
+            parser.add_argument(name, type=item, nargs="+", help=texts.get(name, "").capitalize())
+            continue
         default = list(default) if isinstance(default, list | tuple) else default
         parser.add_argument(f"--{name}", type=item, nargs="+", default=default, help=texts.get(name, "").capitalize())
     return parser

@@ -1,0 +1,8 @@
+"""Reading recordings from the files of laboratories; without torch."""
+
+from neuroprior.behaviour.reading.columns import Columns
+from neuroprior.behaviour.reading.options import Options
+from neuroprior.behaviour.reading.problems import ReadingError
+from neuroprior.behaviour.reading.read import read, read_recordings
+
+__all__ = ["Columns", "Options", "ReadingError", "read", "read_recordings"]

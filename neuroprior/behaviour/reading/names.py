@@ -1,0 +1,138 @@
+"""Names of columns that are known: what each usually holds, and the exports of programs."""
+
+import re
+from typing import NamedTuple
+
+UNIT_IN_BRACKETS = re.compile(r"\s*[(\[](s|sec|secs|seconds|ms|msec|min|h|hh:mm:ss(.ms)?|frames?|hz|mg|mg/kg)[)\]]\s*$", re.I)
+UNIT_AT_END = re.compile(r"\s(s|sec|secs|seconds|sf|ms|hh mm ss ms|hh mm ss|ss msec|seconds since start)$")
+
+NAMES: dict[str, tuple[str, ...]] = {
+    "behaviour": (
+        "behavior", "behaviour", "behaviors", "behaviours", "action", "actions", "activity", "syllable", "concept name",
+        "event", "event name", "label", "labels", "state", "states", "annotation", "behavior code", "behaviour code",
+        "behavior name", "element", "species", "call type", "classifier", "motif", "cluster", "prediction", "code",
+        "b soid labels", "sequence", "seq", "verhalten", "comportement", "comportamiento", "act", "status", "name",
+    ),
+    "subject": (
+        "subject", "subject id", "subjects", "animal", "animal id", "mouse", "mouse id", "rat", "rat id", "bird",
+        "bird id", "individual", "individual id", "focal", "focal animal", "focal subject", "participant",
+        "participant id", "person", "person id", "id", "pid", "ind", "individu", "tier", "case concept name", "case id",
+        "case", "idhous", "subject name", "tier id",
+    ),
+    "recording": (
+        "recording", "recording id", "session", "session id", "observation", "observation id", "video", "video name",
+        "video id", "filename", "file name", "file", "trial", "trial id", "trial name", "notated path", "begin file",
+        "source file", "plan", "plan id", "sequence id", "run", "obs", "case concept name", "case id", "case",
+    ),
+    "start": (
+        "start", "start time", "onset", "onset time", "begin", "begin time", "start timestamp", "from", "time relative",
+        "time", "timestamp", "time timestamp", "times", "t", "trial time", "recording time", "second", "frame",
+        "frame index", "frame number", "frame id", "frames", "beginn", "anfang", "von", "zeit", "debut", "start frame",
+        "begin frame", "onset frame", "time relative hmsf", "time absolute hms", "date time", "datetime", "date",
+    ),
+    "stop": (
+        "stop", "stop time", "end", "end time", "offset", "offset time", "finish", "to", "ende", "bis", "fin",
+        "end timestamp", "stop timestamp", "complete timestamp", "end frame", "stop frame", "offset frame",
+    ),
+    "duration": ("duration", "bout time", "dur", "bout duration", "bout length", "dauer", "length"),
+    "event_type": (
+        "event type", "behavior type", "behaviour type", "lifecycle transition", "transition", "type", "status",
+        "marker", "state event", "start stop", "on off", "onoff",
+    ),
+    "observer": (
+        "observer", "observer id", "observer name", "coder", "coder id", "rater", "scorer", "annotator", "annotator id",
+    ),
+    "factors": (
+        "treatment", "condition", "genotype", "sex", "gender", "group", "drug", "dose", "strain", "age", "phase",
+        "cohort", "line", "diet", "season", "day", "experimental group", "treatment group",
+    ),
+}  # fmt: skip
+"""Words for each use of a column, the surest first, as `plain` writes them."""
+
+
+def plain(name: str) -> str:
+    """Return a column's name in lower case, without punctuation between words and without its unit.
+
+    Example:
+        >>> plain("Start (s)"), plain("case:concept:name"), plain("onset_s")
+        ('start', 'case concept name', 'onset')
+    """
+    short = UNIT_IN_BRACKETS.sub("", str(name).strip().lower())
+    short = re.sub(r"[\s_.:\-]+", " ", short).strip()
+    return UNIT_AT_END.sub("", short)
+
+
+KNOWN_NAMES = frozenset(name for names in NAMES.values() for name in names)
+
+
+class Program(NamedTuple):
+    """An export that is known by its columns.
+
+    Attributes:
+        name: of the program and its kind of file.
+        needs: columns that it has, as `plain` writes them.
+        columns: for each use the column; names in the order of preference.
+        layout: of its rows; "" where it follows from the columns.
+        unit: of its times; "" where the columns say it.
+    """
+
+    name: str
+    needs: frozenset[str]
+    columns: dict[str, tuple[str, ...]]
+    layout: str = ""
+    unit: str = ""
+
+
+def _program(name: str, needs: str, layout: str = "", unit: str = "", **columns: str) -> Program:
+    split = {use: tuple(filter(None, names.split("|"))) for use, names in columns.items()}
+    return Program(name, frozenset(needs.split("|")), split, layout, unit)
+
+
+_BORIS = {"recording": "observation id", "subject": "subject", "behaviour": "behavior"}
+_CASE = {"recording": "case concept name", "subject": "case concept name", "behaviour": "concept name"}
+
+PROGRAMS: tuple[Program, ...] = (
+    _program("BORIS, aggregated events", "observation id|behavior|start|stop", start="start", stop="stop",
+             duration="", event_type="", **_BORIS),
+    _program("BORIS, tabular events", "observation id|behavior|behavior type|time", "rows of starts and stops",
+             start="time", event_type="behavior type", duration="", **_BORIS),
+    _program("BORIS, tabular events (before version 8)", "time|subject|behavior|status", "rows of starts and stops",
+             start="time", event_type="status", duration="", **_BORIS),
+    _program("Noldus Observer, event log", "observation|behavior|event type", "rows of starts and stops",
+             recording="observation", subject="subject", behaviour="behavior", event_type="event type",
+             start="time relative|time relative hmsf|time relative hms", duration="duration"),
+    _program("keypoint-MoSeq, moseq_df", "name|syllable|frame index", "rows of frames", "frames",
+             recording="name", subject="name", behaviour="syllable", start="frame index", factors="group"),
+    _program("keypoint-MoSeq, results", "syllable|centroid x|centroid y", "rows of frames", "frames",
+             behaviour="syllable", start="", factors=""),
+    _program("SimBA, bouts", "video|event|start time|end time", recording="video", behaviour="event",
+             start="start time", stop="end time", duration="bout time", event_type=""),
+    _program("EthoVision, raw data", "trial time|recording time", "columns of behaviours",
+             start="recording time|trial time", behaviour=""),
+    _program("XES, intervals", "case concept name|concept name|time timestamp|start timestamp",
+             start="start timestamp", stop="time timestamp", **_CASE),
+    _program("XES, event log", "case concept name|concept name|time timestamp", start="time timestamp",
+             event_type="lifecycle transition", factors="", **_CASE),
+    _program("crowsetta, generic-seq", "label|onset|offset|annot path", recording="notated path|annot path",
+             behaviour="label", start="onset", stop="offset"),
+    _program("Raven, selection table", "selection|view|begin time|end time", recording="begin file", start="begin time",
+             stop="end time", behaviour="annotation|species|call type|label|call|type|code|notes"),
+)  # fmt: skip
+"""The first whose columns a file has all of is taken."""
+
+WORDS = {
+    "start": ("start", "state start", "begin", "began", "onset", "on", "started", "state begin", "beginn"),
+    "stop": ("stop", "state stop", "end", "ended", "offset", "off", "stopped", "state end", "complete", "finish",
+             "finished", "completed", "ende"),
+    "point": ("point", "instant", "point event", "state point"),
+}  # fmt: skip
+"""Words for the kinds of rows where starts and stops are rows of their own, in lower case."""
+
+MISSING_WORDS = (
+    "", "nan", "na", "n/a", "n.a.", "<na>", "null", "?", "-", "#n/a", "#value!", "#ref!", "#name?", "#div/0!",
+    "#num!",
+)  # fmt: skip
+"""What stands for no label, in lower case."""
+
+NO_SUBJECT = ("no focal subject",)
+"""What a program writes where no subject was chosen, in lower case."""

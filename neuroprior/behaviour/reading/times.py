@@ -1,0 +1,177 @@
+"""Times in texts: numbers, times of day, dates and durations, in the unit of the column or in seconds."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from neuroprior.behaviour.reading.problems import Place, Problems
+
+Floats = NDArray[np.float64]
+
+CLOCK = r"(-?)(?:(\d+):)?(\d+):(\d+(?:[.,]\d*)?)"
+DAYS = r"(-?\d+) days?,? ?(?:\+?(\d+):(\d+):(\d+(?:\.\d*)?))?"
+YEAR_FIRST = r"\d{4}([-/.])\d{1,2}\1\d{1,2}(?:[T ]\S.*)?"
+YEAR_LAST = r"(\d{1,2})[-/. ](\d{1,2})[-/. ](\d{4}|\d{2})(?:[T, ]+(\S.*))?"
+MISSING_TIMES = ("", "na", "nan", "n/a", "null", "none", "nat", "-", "<na>")
+THOUSANDS = r"-?\d{1,3}(,\d{3})+(\.\d*)?"
+
+NUMBERS, CLOCKS, DATES = "numbers", "times of day", "dates"
+
+HALF_A_DAY = 12 * 3600.0
+
+SAMPLE = 2_000
+"""Texts by which a column is judged to hold times."""
+
+
+class Times(NamedTuple):
+    """Times of a column.
+
+    Attributes:
+        values: float64 `[rows]`, NaN where there is none.
+        kind: NUMBERS (in the unit of the column), CLOCKS or DATES (both in seconds).
+    """
+
+    values: Floats
+    kind: str
+
+
+def read_times(
+    texts: Sequence[str] | NDArray[Any],
+    use: str,
+    place: Place,
+    problems: Problems,
+    *,
+    separator: str = "",
+    day_first: bool | None = None,
+) -> Times:
+    """Return the times of a column of texts; what is no time is added to the problems.
+
+    Args:
+        texts: `[rows]`, without space at their ends.
+        use: what they are, for messages.
+        place: where a row stands.
+        problems: gets the entries that are no times.
+        separator: of the cells of the file: beside commas a comma is no decimal mark.
+        day_first: whether 1/2/2024 is the first of February; None: as the other dates of the column tell.
+    """
+    codes, unique = pd.factorize(np.asarray(texts, dtype=object))
+    words = pd.Series(unique, dtype=object)
+    missing = words.str.lower().isin(MISSING_TIMES)
+    numbers = pd.to_numeric(words.where(~missing), errors="coerce")
+    commas = words[numbers.isna() & ~missing]
+    if len(commas) and commas.str.fullmatch(r"-?\d*,\d+").all():
+        if separator == "," and commas.str.fullmatch(THOUSANDS).all():
+            _complain(problems, place, codes, unique, ~missing & numbers.isna(), use, "a number without thousands' commas")
+            return Times(numbers.to_numpy(np.float64)[codes], NUMBERS)
+        numbers = pd.to_numeric(words.where(~missing).str.replace(",", ".", regex=False), errors="coerce")
+    good = numbers.notna() & np.isfinite(numbers.to_numpy(np.float64))
+    if bool((good | missing).all()) or good.sum() > (~good & ~missing).sum():
+        _complain(problems, place, codes, unique, ~good & ~missing, use, "a number")
+        return Times(numbers.where(good).to_numpy(np.float64)[codes], NUMBERS)
+    rest = words.where(~missing)
+    seconds = _clock_seconds(rest, ~missing, codes, unique, use, place, problems)
+    if seconds is not None:
+        return Times(seconds[codes], CLOCKS)
+    return Times(_date_seconds(rest, ~missing, codes, unique, use, place, problems, day_first)[codes], DATES)
+
+
+def count_times(texts: NDArray[Any]) -> tuple[int, int]:
+    """Return how many of some texts (the first `SAMPLE` that differ) hold times of any kind, and how many anything."""
+    words = pd.Series(pd.unique(np.asarray(texts, dtype=object))[:SAMPLE], dtype=object)
+    words = words[~words.str.lower().isin(MISSING_TIMES)]
+    number = pd.to_numeric(words.str.replace(",", ".", regex=False), errors="coerce").notna()
+    other = words.str.fullmatch(f"{CLOCK}|{DAYS}|{YEAR_LAST}") | words.str.fullmatch(YEAR_FIRST)
+    return int((number | other).sum()), len(words)
+
+
+def _complain(
+    problems: Problems, place: Place, codes: NDArray[Any], unique: Any, wrong: Any, use: str, right: str
+) -> None:
+    wrong = np.asarray(wrong, bool)
+    rows = np.flatnonzero(wrong[codes])
+    if rows.size:
+        problems.add(f"`{use}` must be {right}, got {unique[codes[rows[0]]]!r}", rows.tolist(), place)
+
+
+def _clock_seconds(
+    words: Any, filled: Any, codes: Any, unique: Any, use: str, place: Place, problems: Problems
+) -> Floats | None:
+    """Return seconds of h:m:s, m:s and "1 days 00:00:01" texts; None where most are something else.
+
+    Two numbers are minutes and seconds where one of the column has a fraction, or is beyond the hours of a day.
+    """
+    texts = words.astype(object).where(filled, "")
+    days = texts.str.extract(f"^{DAYS}$")
+    parts = texts.str.extract(f"^{CLOCK}$")
+    with_days, clock = days[0].notna(), parts[2].notna()
+    if (with_days | clock).sum() * 2 <= filled.sum():
+        return None
+    sign = np.where(parts[0] == "-", -1.0, 1.0)
+    hours, minutes, seconds = (parts[i].str.replace(",", ".").astype(float) for i in (1, 2, 3))
+    two = hours.isna() & clock
+    if two.any() and not (parts[3][two].str.contains("[.,]") | (minutes[two] > 23)).any():
+        right = "a time as h:m:s; two numbers may be hours and minutes, or minutes and seconds"
+        _complain(problems, place, codes, unique, two, use, right)
+    values = sign * (3600 * hours.fillna(0) + 60 * minutes + seconds)
+    values = values.where((seconds < 60) & (hours.isna() | (minutes < 60)))
+    whole = days.astype(float).fillna(0)
+    values = values.where(~with_days, 86400 * whole[0] + 3600 * whole[1] + 60 * whole[2] + whole[3])
+    _complain(problems, place, codes, unique, filled & values.isna(), use, "a time as h:m:s with minutes and seconds below 60")
+    found: Floats = values.to_numpy(np.float64)
+    return found
+
+
+def _date_seconds(
+    words: Any, filled: Any, codes: Any, unique: Any, use: str, place: Place, problems: Problems, day_first: bool | None
+) -> Floats:
+    """Return seconds since 1970; dates without a time zone are all taken to be in one."""
+    texts = words.astype(object).where(filled, "")
+    parts = texts.str.extract(f"^{YEAR_LAST}$")
+    last = parts[0].notna()
+    if last.any():
+        first, second = parts[0][last].astype(float), parts[1][last].astype(float)
+        if day_first is None:
+            if first.max() <= 12 and second.max() <= 12 and bool((first != second).any()):
+                right = "a date whose day can be told from its month; say --day_first true or false"
+                _complain(problems, place, codes, unique, last, use, right)
+            day_first = bool(first.max() > 12 or second.max() <= 12)
+        day, month = (parts[0], parts[1]) if day_first else (parts[1], parts[0])
+        year = parts[2].where(parts[2].str.len() == 4, "20" + parts[2])
+        iso = year + "-" + month.str.zfill(2) + "-" + day.str.zfill(2) + " " + parts[3].fillna("00:00")
+        texts = texts.where(~last, iso)
+    normal = texts.str.replace(
+        r"^(\d{4})[-/.](\d{1,2})[-/.](\d{1,2})", lambda m: f"{m[1]}-{m[2]:0>2}-{m[3]:0>2}", regex=True
+    )
+    normal = normal.str.replace(r"(:\d+),(\d+)", r"\1.\2", regex=True)
+    dates = pd.to_datetime(normal.where(filled), format="ISO8601", utc=True, errors="coerce")
+    _complain(problems, place, codes, unique, filled & dates.isna(), use, "a time: a number, h:m:s or a date as year-month-day")
+    found: Floats = (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(np.float64)
+    return found
+
+
+def over_midnight(values: Floats, unit: NDArray[np.int64]) -> tuple[Floats, int]:
+    """Return times of day that go on over midnight, and how often they do.
+
+    Where a time is more than half a day before the one above it of the same recording, a new day has begun.
+
+    Args:
+        values: float64 `[rows]`, seconds; NaN for none.
+        unit: int `[rows]`, which recording each is of; the rows of one need not stand together.
+    """
+    series = pd.Series(values)
+    before = series.groupby(unit).transform(lambda one: one.ffill().shift())
+    new = (series - before < -HALF_A_DAY).to_numpy()
+    days = pd.Series(new).groupby(unit).cumsum().to_numpy(np.float64)
+    return values + 86400 * days, int(new.sum())
+
+
+def smallest_unit(texts: NDArray[Any]) -> float:
+    """Return the unit in which numbers are written: 0.01 where some have two decimals, 1 where all are whole."""
+    words = pd.Series(pd.unique(np.asarray(texts, dtype=object)), dtype=object)
+    decimals = words.str.extract(r"[.,](\d+)$")[0].dropna().str.rstrip("0").str.len()
+    return float(10.0 ** -(int(decimals.max()) if len(decimals) else 0))
+
+

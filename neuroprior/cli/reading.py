@@ -1,0 +1,83 @@
+"""Options of the commands that say how recordings are read."""
+
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any, get_origin, get_type_hints
+
+from neuroprior.behaviour.reading import Columns, Options
+
+SPELLED = {"from_": "from"}
+"""Options whose names are words of Python."""
+
+
+def add_reading_arguments(parser: Any) -> None:
+    """Add an option to a parser (jsonargparse's) for each of `Options` and, as `--columns.NAME`, of `Columns`."""
+    texts = {**_described(Options), **{f"columns.{name}": text for name, text in _described(Columns).items()}}
+    for field in fields(Columns):
+        name = f"columns.{field.name}"
+        parser.add_argument(f"--{name}", nargs="+", type=str, default=None, help=texts[name])
+    hints = get_type_hints(Options)
+    for field in fields(Options):
+        kind, text = hints[field.name], texts[field.name]
+        flag = f"--{SPELLED.get(field.name, field.name)}"
+        if field.name == "columns":
+            continue
+        if get_origin(kind) is Mapping:
+            parser.add_argument(flag, nargs="+", type=str, default=None, help=f"{text} As OLD=NEW.")
+        elif get_origin(kind) is Sequence:
+            parser.add_argument(flag, nargs="*", type=str, default=None, help=text)
+        else:
+            parser.add_argument(flag, type=kind, default=field.default, help=text)
+
+
+def _described(kind: type) -> dict[str, str]:
+    """Return what the docstring of a class says of its attributes."""
+    from docstring_parser import parse
+
+    entries = parse(inspect.getdoc(kind) or "").params
+    found = {name.strip(): entry for entry in entries for name in entry.arg_name.split(",")}
+    return {name: " ".join((entry.description or "").split()).capitalize() for name, entry in found.items()}
+
+
+def pop_reading(settings: dict[str, Any]) -> Options:
+    """Take the options that `add_reading_arguments` added out of the settings of a command.
+
+    Raises:
+        ValueError: an option is out of range.
+    """
+    columns = {use: names[0] if len(names) == 1 else names for use, names in settings.pop("columns").items() if names}
+    given: dict[str, Any] = {"columns": columns}
+    for field in fields(Options):
+        value = settings.pop(SPELLED.get(field.name, field.name), None)
+        if value is None:
+            continue
+        given[field.name] = _pairs(field.name, value) if field.name in ("words", "rename") else value
+    return Options(**given)
+
+
+def _pairs(name: str, texts: Sequence[str]) -> dict[str, str]:
+    if wrong := [text for text in texts if "=" not in text]:
+        raise ValueError(f"`{name}` must be given as OLD=NEW, got {wrong[0]!r}")
+    return {old: new for old, _, new in (text.partition("=") for text in texts)}
+
+
+def reading_words(options: Options) -> list[str]:
+    """Return options as words of a command line, those that have their default values left out."""
+    words: list[str] = []
+    assert isinstance(options.columns, Columns)
+    for use, names in options.columns.named().items():
+        words += [f"--columns.{use}", *names]
+    defaults = Options()
+    for field in fields(Options):
+        value = getattr(options, field.name)
+        if field.name == "columns" or value == getattr(defaults, field.name):
+            continue
+        flag = f"--{SPELLED.get(field.name, field.name)}"
+        if isinstance(value, Mapping):
+            words += [flag, *(f"{old}={new}" for old, new in value.items())]
+        elif isinstance(value, Sequence) and not isinstance(value, str):
+            words += [flag, *value]
+        else:
+            words += [flag, str(value).lower() if isinstance(value, bool) else str(value)]
+    return words
