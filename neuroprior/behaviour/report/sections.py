@@ -14,6 +14,7 @@ from neuroprior.behaviour.analysis.drift import action_drift, by_group, by_plan,
 from neuroprior.behaviour.analysis.lags import mutual_information
 from neuroprior.behaviour.analysis.motifs import motifs
 from neuroprior.behaviour.analysis.transitions import transitions
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.report import figures
 from neuroprior.behaviour.report.conditions import condition_section
 from neuroprior.behaviour.report.document import Column, table
@@ -60,7 +61,7 @@ def file_section(found: Evaluation) -> Part:
     return Part(Section("Plans", tables=tables, figures=boxes), {"actions": frame})
 
 
-def action_frame(plans: Plans) -> pd.DataFrame:
+def action_frame(plans: RecordedPlans) -> pd.DataFrame:
     """How often each action occurs, in how many plans, and its median duration; the commonest first."""
     mask = plans.mask()
     plan = mask.nonzero()[:, 0]
@@ -75,7 +76,7 @@ def action_frame(plans: Plans) -> pd.DataFrame:
     return frame if plans.durations is not None else frame.drop(columns="median_duration")
 
 
-def describe(plans: Plans) -> dict[str, Any]:
+def describe(plans: RecordedPlans) -> dict[str, Any]:
     """How many plans there are, of which lengths, with which context."""
     lengths = plans.mask().sum(1)
     context = "none"
