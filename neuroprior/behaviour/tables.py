@@ -503,7 +503,8 @@ def fields_of(
             )
     if unused:
         notes.append(f"columns that are not used: {listed(list(unused.values()))}")
-    return found | {"notes": tuple(notes)}
+    # Names of columns may have characters that no file can hold.
+    return found | {"notes": tuple(note.encode("utf-8", "replace").decode() for note in notes)}
 
 
 def _paired(table: Table) -> tuple[Table, list[str]]:

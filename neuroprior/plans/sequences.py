@@ -150,6 +150,8 @@ def _rows(values: Tensor | Sequence[str], index: Tensor | slice) -> Tensor | Seq
     """The entries at `index` of a tensor, or of texts."""
     if isinstance(values, Tensor):
         return values[index]
+    if isinstance(index, slice):
+        return tuple(values)[index]
     return tuple(values[i] for i in torch.arange(len(values))[torch.as_tensor(index).cpu()].tolist())
 
 

@@ -219,4 +219,5 @@ def pieces(plans: Plans, length: int, most: int, generator: torch.Generator | No
         group=plans.group[plan] if plans.group is not None and grouped else units(plans, start_here)[plan, start],
         context_names=plans.context_names,
         group_names=plans.group_names if grouped else None,
+        end=plans.end,
     )
