@@ -53,30 +53,25 @@ class RecordedPlans(Plans):
             object.__setattr__(self, "recording", tuple(self.recording or ()))
         taken, acted = self.mask(), self.mask(end=False)
         if self.began is not None:
-            began = self._times("began", self.began, torch.float64)
+            began = self._times("began", self.began, torch.float64, -torch.inf)
             object.__setattr__(self, "began", began.masked_fill(~acted, torch.nan).masked_fill(~taken, 0))
         if self.durations is not None:
-            durations = self._times("durations", self.durations, torch.float32)
-            wrong = (durations < 0) & acted
-            if wrong.any():
-                where = wrong.nonzero()[0].tolist()
-                raise ValueError(
-                    f"`durations{where}` must be finite times from 0, got {float(durations[tuple(where)])}"
-                )
+            durations = self._times("durations", self.durations, torch.float32, 0)
             object.__setattr__(self, "durations", durations.masked_fill(~acted, 0))
         if self.condition is not None:
             object.__setattr__(self, "condition", as_integers("condition", self.condition, num))
         check_numbered("condition", self.condition, self.condition_names)
         check_texts("notes", self.notes)
 
-    def _times(self, name: str, values: Tensor, dtype: torch.dtype) -> Tensor:
-        """Numbers `[N, L]`, finite or NaN where there are actions."""
+    def _times(self, name: str, values: Tensor, dtype: torch.dtype, lowest: float) -> Tensor:
+        """Numbers `[N, L]`, where there are actions finite and at least `lowest`, or NaN."""
         times = as_numbers(name, values).to(dtype)
         check_shape(name, times, tuple(self.actions.shape))
-        if (wrong := times.isinf() & self.mask(end=False)).any():
+        wrong = ((times < lowest) | times.isinf()) & self.mask(end=False)
+        if wrong.any():
             where = wrong.nonzero()[0].tolist()
-            lowest = " from 0" if name == "durations" else ""
-            raise ValueError(f"`{name}{where}` must be finite times{lowest}, got {float(times[tuple(where)])}")
+            bound = " from 0" if lowest == 0 else ""
+            raise ValueError(f"`{name}{where}` must be finite times{bound}, got {float(times[tuple(where)])}")
         return times
 
     @classmethod

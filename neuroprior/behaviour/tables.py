@@ -24,6 +24,7 @@ import torch
 from numpy.typing import NDArray
 
 from neuroprior._checks import check_flags, is_number, precision_lost
+from neuroprior.behaviour.analysis.comparison import never_occur
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.plans.columns import (
     LARGEST_FLOAT,
@@ -35,7 +36,6 @@ from neuroprior.plans.columns import (
     check_names,
     is_missing,
     listed,
-    never_occur,
     number_in,
     open_text,
     padded,

@@ -245,14 +245,6 @@ def warn_of_unused(path: Path, what: str, names: Sequence[str]) -> None:
         warn_caller(f"{path}: {what} that are not used: {listed(names)}")
 
 
-def never_occur(occur: Integers, num_actions: int, names: Sequence[str] | None = None) -> str:
-    """Which of the actions are none of those that `occur`, and that they never occur; "" where all do."""
-    number = num_actions - len(occur)
-    first = np.setdiff1d(np.arange(min(num_actions, len(occur) + SHOWN)), occur).tolist()  # at least `SHOWN`, or all
-    verb = "occurs" if number == 1 else "occur"
-    return f"{listed(named(first, names), number)} never {verb}" if number else ""
-
-
 def listed(values: Sequence[Any] | NDArray[Any], number: int | None = None) -> str:
     """The first `SHOWN` of some values, and how many more there are; `number` of them in all."""
     more = (len(values) if number is None else number) - SHOWN

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neuroprior._statistics import ENOUGH_UNITS
-from neuroprior.behaviour.analysis.comparison import never_taken, too_few, unit_name, units
+from neuroprior.behaviour.analysis.comparison import never_occur, never_taken, too_few, unit_name, units
 from neuroprior.behaviour.analysis.drift import action_drift, by_group, by_plan, by_position
 from neuroprior.behaviour.analysis.lags import mutual_information
 from neuroprior.behaviour.analysis.motifs import motifs
@@ -25,7 +25,6 @@ from neuroprior.behaviour.report.page import FigureBox, Section
 from neuroprior.behaviour.report.part import LISTED, SIGNIFICANT, Part, action_names, group_names, p_text
 from neuroprior.behaviour.report.scores import Evaluation
 from neuroprior.plans import Plans, constant_context, has_patterns
-from neuroprior.plans.columns import never_occur
 
 MOST_LAG = 20
 LISTED_LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 20)

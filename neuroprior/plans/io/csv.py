@@ -34,8 +34,7 @@ DELIMITERS = (",", ";", "\t")
 OUR_COLUMN = re.compile(r"group|(action|context)_\d+|context")
 
 OTHER_WORDS = re.compile(
-    r"plan|action|condition|start|stop|duration|session|subject|animal|behaviou?r|group|context|time|frame|event|label"
-    r"|trial|code"
+    r"plan|action|session|subject|animal|behaviou?r|group|context|time|frame|event|label|trial|code"
 )
 """Names of columns of tables of events."""
 
