@@ -1,6 +1,8 @@
 """Checks of arguments, each of which names the argument that is wrong."""
 
 import os
+import sys
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from numbers import Real
@@ -182,3 +184,11 @@ def physical_memory() -> int | None:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, OSError, ValueError):  # of Windows, and of systems without these names
         return None
+
+
+def warn_caller(message: str) -> None:
+    """Warn where the library was called from."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("neuroprior."):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, stacklevel=level)

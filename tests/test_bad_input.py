@@ -22,9 +22,11 @@ from neuroprior import (
     write_plans,
 )
 from neuroprior.__main__ import main
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.report import FitOptions, ReadOptions
 from neuroprior.behaviour.report.figures import ethogram_figure
 from neuroprior.behaviour.report.plan_report import report
+from neuroprior.behaviour.tables import plans_of_frame
 from neuroprior.control import ICEMPlanner, PlanarArm, control
 from neuroprior.planners import FrontierPlanner, expected_score
 from neuroprior.plans import folds
@@ -42,7 +44,7 @@ ARM = PlanarArm()
 def test_names_are_texts_and_distinct(what, names, says):
     numbers = {} if what == "action" else {what: torch.tensor([0])}
     with refuses(f"{what}_names", says):
-        Plans(ACTIONS, 2, **numbers, **{f"{what}_names": names})
+        RecordedPlans(ACTIONS, 2, **numbers, **{f"{what}_names": names})
 
 
 def test_numbers_of_actions(tmp_path):
@@ -117,11 +119,11 @@ FITTED = {"a": UniformPrior(2)}
         (lambda: write_plans(PLANS, None), ["path", "NoneType"]),
         (lambda: Plans(ACTIONS, 2, end=True), ["end", "True"]),
         (lambda: Plans(ACTIONS, 2, action_names=iter("ab")), ["action_names", "list of texts"]),
-        (lambda: Plans(ACTIONS, 2, notes=3), ["notes", "list of texts"]),
-        (lambda: Plans.from_dataframe(pd.DataFrame({"action": [[1], [2]]})), ["column 'action'", "names or numbers"]),
-        (lambda: Plans.from_dataframe(pd.DataFrame([[1, 2]], columns=["action"] * 2)), ["'action'", "twice"]),
+        (lambda: RecordedPlans(ACTIONS, 2, notes=3), ["notes", "list of texts"]),
+        (lambda: plans_of_frame(pd.DataFrame({"action": [[1], [2]]})), ["column 'action'", "names or numbers"]),
+        (lambda: plans_of_frame(pd.DataFrame([[1, 2]], columns=["action"] * 2)), ["'action'", "twice"]),
         (
-            lambda: Plans.from_dataframe(pd.DataFrame({"action": [0], "x": [1.5]}), context=["x", "x"]),
+            lambda: plans_of_frame(pd.DataFrame({"action": [0], "x": [1.5]}), {"context": ["x", "x"]}),
             ["columns.context", "twice"],
         ),
         (lambda: fit(PLANS, 3), ["prior", "a class", "3"]),

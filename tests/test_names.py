@@ -8,7 +8,7 @@ import torch
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, SamplingPlanner, UniformPrior
 from neuroprior.agents import Agent, Replay
-from neuroprior.behaviour import SemiMarkovPrior
+from neuroprior.behaviour import RecordedPlans, SemiMarkovPrior
 from neuroprior.control import (
     DoubleIntegrator,
     NoisePrior,
@@ -36,7 +36,7 @@ def learned(plans: Plans) -> MarkovPrior:
 
 
 def timed(plans: Plans) -> Plans:
-    return replace(plans, durations=1.0 + plans.actions)
+    return replace(RecordedPlans.of(plans), durations=1.0 + plans.actions)
 
 
 def stored(plans: Plans) -> None:

@@ -11,6 +11,7 @@ import neuroprior
 from neuroprior import CombinedPrior, MarkovPrior, Plans, TabularWorld, UniformPrior
 from neuroprior.__main__ import main
 from neuroprior.behaviour import DurationModel, SemiMarkovPrior
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.control import (
     DoubleIntegrator,
     VectorPlans,
@@ -147,7 +148,7 @@ def test_worlds_move_to_a_device(world) -> None:
 
 def test_durations_are_counted_anew() -> None:
     durations = torch.tensor([[1.0, 4.0, 1.2, 3.5]]).repeat(20, 1) * torch.linspace(0.5, 2, 20)[:, None]
-    plans = Plans(torch.tensor([[0, 1, 0, 1]]).repeat(20, 1), 2, durations=durations)
+    plans = RecordedPlans(torch.tensor([[0, 1, 0, 1]]).repeat(20, 1), 2, durations=durations)
     prior = SemiMarkovPrior(2).fit(plans[:4])
     fewer = prior.log_prob(plans)
     assert not torch.allclose(prior.recount(plans).log_prob(plans), fewer)
@@ -160,7 +161,7 @@ def named(order: str = "abc", contexts: str = "LR", per: str = "plan", end: bool
     number = torch.tensor(["abc".index(name) for name in order]).argsort()
     context = torch.arange(30) % 2 if per == "plan" else (torch.arange(30) % 2)[:, None].expand(30, 12)
     how = {"action_names": tuple(order), "context": context, "context_names": tuple(contexts)}
-    plans = Plans(number[actions], 3, durations=torch.ones(30, 12), **how)
+    plans = RecordedPlans(number[actions], 3, durations=torch.ones(30, 12), **how)
     return plans.with_end() if end else plans
 
 

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from neuroprior import Plans
 from neuroprior.behaviour.report import FitOptions, report
 from neuroprior.behaviour.study import simulated_study
+from neuroprior.behaviour.tables import plans_of_frame
 
 names = {"action": "behaviour", "plan": "session", "group": "animal"}
-report(Plans.from_dataframe(simulated_study(0), **names), fits=FitOptions(["counts"], processes=1), out="report")
+report(plans_of_frame(simulated_study(0), names), fits=FitOptions(["counts"], processes=1), out="report")
 assert "<svg" in Path("report/report.html").read_text(encoding="utf-8")

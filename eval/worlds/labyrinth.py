@@ -46,7 +46,7 @@ def cut_plans(plans: Plans, length: int) -> Plans:
         return values[:, : pieces * length].reshape(-1, length)
 
     group = torch.arange(len(plans)).repeat_interleave(pieces)
-    return replace(plans, actions=cut(plans.actions), context=cut(plans.context), group=group, plan_names=None)
+    return replace(plans, actions=cut(plans.actions), context=cut(plans.context), group=group)
 
 
 def arrivals(plans: Plans) -> Tensor:

@@ -51,13 +51,12 @@ from neuroprior.behaviour.analysis.permutation_design import PermutationDesign
 from neuroprior.behaviour.analysis.transitions import Transitions, transitions
 from neuroprior.behaviour.durations.duration_model import DurationLaw, DurationModel
 from neuroprior.behaviour.durations.laws import LAW_NAMES, LawName
+from neuroprior.behaviour.durations.past_durations import PastDurations
 from neuroprior.behaviour.durations.semi_markov import SemiMarkovPrior
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.study import simulated_study
-from neuroprior.behaviour.tables import fields_of
-from neuroprior.plans.columns import READERS
 from neuroprior.priors.fitting import PRIORS
 
-READERS.add("events", fields_of)
 PRIORS.add("semi-markov", SemiMarkovPrior)
 
 __all__ = [
@@ -76,9 +75,11 @@ __all__ = [
     "LawName",
     "ModeChoice",
     "Motif",
+    "PastDurations",
     "PermutationDesign",
     "PlanDrift",
     "PositionDrift",
+    "RecordedPlans",
     "Score",
     "SemiMarkovPrior",
     "Transitions",

@@ -16,14 +16,17 @@ from rich.console import Console
 
 from neuroprior._files import write_whole
 from neuroprior.behaviour.analysis.modes import choose_modes
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.report.document import printed, write_frames
 from neuroprior.behaviour.report.modes import choice_table
+from neuroprior.behaviour.report.options import ReadOptions
+from neuroprior.behaviour.tables import Columns, Missing
 from neuroprior.cli.fit_data import Parts, divide
 from neuroprior.cli.fit_report import report
 from neuroprior.cli.program import make_parser
 from neuroprior.planners import Planner, collect
-from neuroprior.plans import read_plans, write_plans
-from neuroprior.plans.columns import Columns, Missing
+from neuroprior.plans import write_plans
+from neuroprior.plans.io.npz import read_npz
 from neuroprior.priors import CombinedPrior, Prior, SwitchingPrior, load
 from neuroprior.priors.ensembles.candidates import Effort
 from neuroprior.priors.fitting import make_prior
@@ -152,19 +155,11 @@ def fit(
     if resume is None and folder.exists() and any(folder.iterdir()):
         raise ValueError(f"`out` must be a new or empty folder, got {out}; --resume {out} goes on with a run there.")
     if resume is not None:
-        source = read_plans(folder / PLANS)
+        source = read_npz(folder / PLANS, None, None, RecordedPlans)
     elif plans is not None:
-        source = read_plans(
-            plans,
-            num_actions=num_actions,
-            action_names=action_names,
-            columns=columns,
-            missing=missing,
-            merge_repeats=merge_repeats,
-            max_gap=max_gap,
-        )
+        source = ReadOptions(columns, missing, merge_repeats, max_gap, num_actions, action_names).read(plans)
     elif world is not None and planner is not None:
-        source = collect(planner, world, num_plans, context=context, generator=generator)
+        source = RecordedPlans.of(collect(planner, world, num_plans, context=context, generator=generator))
     else:
         raise ValueError(f"`plans` must be a file, or give --config and a recipe: {', '.join(recipes())}.")
     ended = source.with_end() if end and source.end is None else source
@@ -177,8 +172,6 @@ def fit(
         raise ValueError(
             f"`prior` must take what it is given: {error}; --use_context false leaves the context out."
         ) from error
-    if made.takes_context:
-        made.past_durations = parts.past_durations
     frames = {}
     if modes is not None:
         made, frames["modes"] = _choose_modes(made, modes, parts)

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import torch
 
+from neuroprior.behaviour.durations.past_durations import PastDurations
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import fair_split, longest_cut, num_units, ungrouped
-from neuroprior.plans.past_durations import PastDurations
 from neuroprior.priors.construction import context_arguments
 
 MIN_PARTS, MIN_ACTIONS = 3, 2

@@ -29,7 +29,8 @@ def report(
 ) -> None:
     """Save the prior, compare it with baselines, and print the table.
 
-    Writes the prior's files, `metrics.json`, `metrics.csv` and, for a network, the learning curve.
+    Writes the prior's files, `past_durations.json` where it takes durations, `metrics.json`, `metrics.csv` and, for a
+    network, the learning curve.
 
     Args:
         folder: of the run.
@@ -42,6 +43,8 @@ def report(
     console = Console()
     prior, name = prior.cpu().eval(), name_of(prior)
     save(prior, folder)
+    if data.past_durations is not None and prior.takes_context:
+        data.past_durations.save(folder)
     many = data.folds > 1
     keep_learned(folder, data.learned_from, data.chosen_on, held_out=None if many else data.held_out, plans=data.plans)
     contexts = data.num_contexts if prior.takes_context else None

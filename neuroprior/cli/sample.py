@@ -22,7 +22,7 @@ def sample(
     seed: NonNegativeInt = 0,
     out: str | None = None,
 ) -> None:
-    """Sample new plans from a saved prior, with the names of its actions; from a semi-Markov prior, with durations.
+    """Sample new plans from a saved prior, with the names of its actions.
 
     Args:
         folder: a saved prior, as `neuroprior fit` writes it.
@@ -32,7 +32,7 @@ def sample(
         temperature: divides the logits; above 1 plans are more varied, below 1 more alike.
         seed: of the random numbers: the same seed gives the same plans.
         out: file to write, `.jsonl`, `.csv` or `.npz`, which is not there yet; JSON lines on standard output by
-            default.
+            default. Of a semi-Markov prior, `.npz` holds durations, too.
     """
     if seed >= 2**63:
         raise ValueError(f"seed: an integer from 0 to 2**63 - 1 is expected, not {seed}")
@@ -41,7 +41,8 @@ def sample(
     prior = load(folder)
     generator = torch.Generator().manual_seed(seed)
     given = _context(prior, context, folder, num_plans)
-    if isinstance(prior, SemiMarkovPrior):
+    plans: Plans
+    if isinstance(prior, SemiMarkovPrior) and out is not None and Path(out).suffix.lower() == ".npz":
         plans = prior.sample_plans(num_plans, length, given, temperature=temperature, generator=generator)
         plans = plans.without_context()
     else:

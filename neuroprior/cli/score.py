@@ -1,17 +1,18 @@
 """`neuroprior score`: how probable plans are under a saved prior."""
 
-from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 from rich.console import Console
 
 from neuroprior.behaviour.analysis.comparison import action_bits, score_bits, too_few, unit_name
+from neuroprior.behaviour.durations.past_durations import PastDurations
 from neuroprior.behaviour.report.document import printed, table, write_frames
-from neuroprior.plans import Plans, read_plans
-from neuroprior.plans.columns import Columns, Missing
+from neuroprior.behaviour.report.options import ReadOptions
+from neuroprior.behaviour.tables import Columns, Missing
+from neuroprior.plans import Plans
 from neuroprior.plans.io import is_table
 from neuroprior.priors import load
 from neuroprior.priors.matching import learned_names, match_plans, numbered_note, taken_note, with_contexts_of
@@ -52,16 +53,16 @@ def score(
         out: folder for `plans.csv` and, where there are any, `groups.csv` and `conditions.csv`.
     """
     prior, place = load(folder), Path(out)
-    how: dict[str, Any] = {"num_actions": num_actions, "columns": columns, "missing": missing}
-    how |= {"merge_repeats": merge_repeats, "max_gap": max_gap}
+    plain = ReadOptions(columns, missing, merge_repeats, max_gap, num_actions)
     known = learned_names(prior)
     tabular = is_table(file)
     # Numbers in a CSV file are the prior's own; its names make sure that there are as many.
-    plans = read_plans(file, action_names=action_names or (known if tabular else None), **how)
-    by_number = plans.action_names is None or (tabular and action_names is None and _by_number(plans, file, how))
+    plans = replace(plain, action_names=action_names or (known if tabular else None)).read(file)
+    by_number = plans.action_names is None or (tabular and action_names is None and _by_number(plans, file, plain))
     plans = plans if plans.end is None else plans.without_end()
     plans, notes = with_contexts_of(prior, plans, tabular)
-    own = match_plans(plans, prior, folder)
+    own, past = match_plans(plans, prior, folder), PastDurations.load(Path(folder))
+    own = own if past is None else past.added_to(own)
     for path in (place / f"{by}s.csv" for by in UNITS if by == "plan" or getattr(plans, by) is not None):
         if path.exists() and not _is_of_scores(path):
             raise ValueError(f"out: {path} is there, and holds no scores; give another folder")
@@ -77,6 +78,7 @@ def score(
     name = "groups" if "groups" in frames else "plans"
     frame = frames[name]
     first = {name[:-1]: name[:-1]} | ({"plans": "plans:,"} if name == "groups" else {})
+    first |= {"recording": "recording"} if "recording" in frame else {}
     numbers = {
         "actions": "actions:,",
         "log-likelihood (nats)": "log_likelihood:.2f",
@@ -108,10 +110,10 @@ def score(
     )
 
 
-def _by_number(plans: Plans, file: str, how: Mapping[str, Any]) -> bool:
+def _by_number(plans: Plans, file: str, reading: ReadOptions) -> bool:
     """Whether actions in the table that plans were read from are numbers, and none of the prior's names."""
     with suppress(ValueError):  # without the names of the prior it might not be read
-        plain = read_plans(file, **how)
+        plain = reading.read(file)
         return plain.action_names is None and plain.actions.equal(plans.actions)
     return False
 

@@ -1,7 +1,6 @@
 """Reading and writing plans of vectors: `.npz`, Minari datasets with a Box of actions, trajectories in memory."""
 
 import os
-import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from torch import Tensor
 from neuroprior._checks import kind_of
 from neuroprior._files import written_whole
 from neuroprior.control.vector_plans import VectorPlans
-from neuroprior.plans.columns import listed, padded
+from neuroprior.plans.columns import padded, warn_of_unused
 from neuroprior.plans.io.minari import local_dataset, one_line
 from neuroprior.plans.io.npz import arrays_of, as_array, names_of, native
 from neuroprior.plans.io.trajectories import array_of, check_are_several, joined, observations_of, parts_of
@@ -62,8 +61,7 @@ def read_vector_plans(path: str | os.PathLike[str]) -> VectorPlans:
             f"{place}: `actions` must have shape [N, L, D], got {list(numbers['actions'].shape)} (cut a flat recording"
             " into episodes for vector_plans_from_trajectories; read_plans reads discrete actions)"
         )
-    if unused:
-        warnings.warn(f"{place}: arrays that are not used: {listed(unused)}", stacklevel=2)
+    warn_of_unused(place, "arrays", unused)
     try:
         return VectorPlans(**numbers, action_names=names)
     except (ValueError, RuntimeError, IndexError) as error:

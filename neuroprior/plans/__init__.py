@@ -1,6 +1,5 @@
 """Executed plans: the action sequences that were chosen before, from which a prior learns; reading, writing, folds."""
 
-from neuroprior.plans.columns import Columns, Missing
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, divisible, folds, in_parts
 from neuroprior.plans.io import (
     from_trajectories,
@@ -10,7 +9,6 @@ from neuroprior.plans.io import (
     write_minari,
     write_plans,
 )
-from neuroprior.plans.past_durations import PastDurations
 from neuroprior.plans.plans import (
     Plans,
     action_dtype,
@@ -23,10 +21,7 @@ from neuroprior.plans.sequences import constant_context, expand_context
 
 __all__ = [
     "BLOCKS",
-    "Columns",
     "FEWEST_UNITS",
-    "Missing",
-    "PastDurations",
     "Plans",
     "action_dtype",
     "all_plans",

@@ -1,27 +1,21 @@
 """What the readers of plans share: opening files, columns of numbers or names, padding."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import IO, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from neuroprior._checks import check_single_precision
-from neuroprior._registry import Registry
+from neuroprior._checks import check_single_precision, warn_caller
 
 Integers = NDArray[np.integer[Any]]
 Floats = NDArray[np.floating[Any]]
 Names = tuple[str, ...]
 Place = Callable[[int], str]
 """Where an entry stands: its position among all the entries to "FILE, line N"."""
-
-Missing = Literal["gap", "label", "error"]
-"""What rows without a label do in tables of events."""
 
 MOST_ENTRIES = 2**33
 """Entries of padded plans beyond which a file is refused."""
@@ -34,58 +28,13 @@ BLOCK = 2**20
 SHOWN = 8
 """Names in a note; more are left out."""
 
-READERS: Registry[Callable[..., dict[str, Any]]] = Registry()
-"""Readers of tables that a wing adds: of a frame of "events" to the fields of `Plans`."""
+NUMBERED = ("action", "context")
+"""Columns that hold numbers or names alone. Elsewhere, as among groups, one name makes names of all."""
 
 MISSING_LABELS = frozenset(
     ("", "nan", "na", "n/a", "n.a.", "<na>", "null", "?", "-", "#n/a", "#value!", "#ref!", "#name?", "#div/0!", "#num!")
 )
 """What stands for no label in tables, in lower case."""
-
-NAMED = ("group", "condition")
-"""Columns in which names may stand beside numbers, and numbers need not be whole, such as a dose: all are names
-then.
-"""
-
-
-@dataclass(frozen=True)
-class Columns:
-    """Which columns of a table of events hold what; where none is given, the column of that name, if there is one.
-
-    Attributes:
-        action: what was done: names, or whole numbers from 0.
-        plan: which rows belong together, such as the session; with a group, the same name in two groups is two plans.
-            Without it each group is one plan, and without a group the whole table is one.
-        context: what was known when the action was chosen: a column of names or whole numbers, or columns of features.
-        group: what is independent, such as the animal.
-        condition: what is to be compared, such as the treatment or the genotype; one for each plan.
-        start: when the action began: numbers, times of day or dates; the rows of a plan are put in this order.
-        stop: when it ended, as `start`.
-        duration: how long it took, in place of `stop`; where both are there, it counts.
-        event_type: START, STOP or POINT, where the start and the stop of an action are rows of their own, as in the
-            tabular export of BORIS; `start` is the time of each row then.
-
-    Example:
-        >>> Columns(action="behaviour", plan="session", group="animal").group
-        'animal'
-    """
-
-    action: str | None = None
-    plan: str | None = None
-    context: str | Sequence[str] | None = None
-    group: str | None = None
-    condition: str | None = None
-    start: str | None = None
-    stop: str | None = None
-    duration: str | None = None
-    event_type: str | None = None
-
-
-def fields_of_events(frame: Any, columns: Columns | Mapping[str, Any] | None = None, **options: Any) -> dict[str, Any]:
-    """Return what `Plans` are made of, by name, from a frame with one action a row; see `Plans.from_dataframe`."""
-    read = READERS.find("events")
-    assert read is not None
-    return read(frame, columns, **options)
 
 
 def is_missing(text: str) -> bool:
@@ -184,7 +133,7 @@ class Column(dict[str, int]):
             return
         if not label:
             raise ValueError(f"`{self.what}` must be a number or a name, got an empty cell")
-        if self.what not in NAMED and isinstance(number_in(label, self.what), float):
+        if self.what in NUMBERED and isinstance(number_in(label, self.what), float):
             hint = "features go into columns context_1, context_2, ..." if self.what == "context" else "or a name"
             raise ValueError(f"{self.what} {label!r} is not a whole number ({hint})")
 
@@ -228,7 +177,7 @@ class Column(dict[str, int]):
         labels = list(self.labels)
         numbers = [number_in(label, self.what) if self.untyped else None for label in labels]
         named = self.names is not None and all(label in self.names for label in labels)
-        whole = all(isinstance(number, int) or (number is not None and self.what not in NAMED) for number in numbers)
+        whole = all(isinstance(number, int) or (number is not None and self.what in NUMBERED) for number in numbers)
         if not named and whole:
             return self._in_range(np.array(numbers, np.int64)[values], place), self.names
         names = self.names if self.names is not None else tuple(sorted(labels))
@@ -249,7 +198,7 @@ class Column(dict[str, int]):
         # One subject called 12b makes names of the other subjects' numbers; a name among numbers of actions or contexts
         # is rather a slip, and would renumber them all.
         is_number = [number is not None for number in numbers]
-        if self.what not in NAMED and any(is_number):
+        if self.what in NUMBERED and any(is_number):
             wrong = is_number.index(not is_number[0])
             kinds = ("a name where others are numbers", "a number where others are names")
             hint = "; give action_names if all are names, or name the columns of a header action_1, ..."
@@ -260,7 +209,7 @@ class Column(dict[str, int]):
         return None
 
     def _in_range(self, values: Integers, place: Place) -> Integers:
-        lowest, stop = (0 if self.what not in NAMED or self.names else -LARGEST_INTEGER), self.count or LARGEST_INTEGER
+        lowest, stop = (0 if self.what in NUMBERED or self.names else -LARGEST_INTEGER), self.count or LARGEST_INTEGER
         if values.size and (values.min() < lowest or values.max() >= stop):
             wrong = int(((values < lowest) | (values >= stop)).argmax())
             expected = f"0 to {stop - 1} are expected" if self.count else "0 or more is expected"
@@ -290,28 +239,10 @@ def named(values: Any, names: Sequence[str] | None) -> Any:
     return [named(value, names) for value in values] if isinstance(values, list) else names[values]
 
 
-def never_notes(actions: Integers, num_actions: int) -> list[str]:
-    """A note where some of the action numbers below the largest never occur: codes from 1, say, or with gaps."""
-    never = never_occur(np.unique(actions), num_actions)
-    return [f"actions are numbers from 0 to {num_actions - 1}, of which {never}"] if never else []
-
-
-def feature_notes(context: Tensor | None, length: int) -> list[str]:
-    """A note where features `[N, C]` of plans may have been meant as one feature of each action, as many as these."""
-    if context is None or not context.is_floating_point() or context.dim() != 2 or not 1 < context.shape[1] == length:
-        return []
-    return [
-        f"context: {length} features of each plan, known from its first action on; if it is one feature of each of the"
-        f" {length} actions, give [N, {length}, 1], lists of one number each"
-    ]
-
-
-def never_occur(occur: Integers, num_actions: int, names: Sequence[str] | None = None) -> str:
-    """Which of the actions are none of those that `occur`, and that they never occur; "" where all do."""
-    number = num_actions - len(occur)
-    first = np.setdiff1d(np.arange(min(num_actions, len(occur) + SHOWN)), occur).tolist()  # at least `SHOWN`, or all
-    verb = "occurs" if number == 1 else "occur"
-    return f"{listed(named(first, names), number)} never {verb}" if number else ""
+def warn_of_unused(path: Path, what: str, names: Sequence[str]) -> None:
+    """Warn of arrays or keys of a file that are not used, such as misspelt ones."""
+    if names:
+        warn_caller(f"{path}: {what} that are not used: {listed(names)}")
 
 
 def listed(values: Sequence[Any] | NDArray[Any], number: int | None = None) -> str:

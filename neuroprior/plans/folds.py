@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from neuroprior._checks import check_same_names, check_seed, check_sizes
-from neuroprior.plans.plans import Plans
+from neuroprior.plans.plans import AnyPlans, Plans
 from neuroprior.plans.sequences import Sequences
 
 FEWEST_UNITS = 2
@@ -19,10 +19,10 @@ BLOCKS = 40
 DRAWS = 8
 """How often plans that are held out are drawn, until they are a fair share of the actions."""
 
-AnyPlans = TypeVar("AnyPlans", bound=Sequences)
+AnySequences = TypeVar("AnySequences", bound=Sequences)
 
 
-def divisible(plans: AnyPlans) -> AnyPlans:
+def divisible(plans: AnySequences) -> AnySequences:
     """The same plans, without their group if they have fewer than two groups, so that they can be split.
 
     Args:
@@ -35,13 +35,13 @@ def divisible(plans: AnyPlans) -> AnyPlans:
     return plans if plans.group is not None and num_units(plans) >= FEWEST_UNITS else ungrouped(plans)
 
 
-def ungrouped(plans: AnyPlans) -> AnyPlans:
+def ungrouped(plans: AnySequences) -> AnySequences:
     """The same plans without their group."""
     names: dict[str, None] = {"group_names": None} if isinstance(plans, Plans) else {}
     return replace(plans, group=None, **names)  # type: ignore[type-var]
 
 
-def longest_cut(plans: AnyPlans, share: float) -> tuple[AnyPlans, AnyPlans]:
+def longest_cut(plans: AnySequences, share: float) -> tuple[AnySequences, AnySequences]:
     """The plans, the longest without its end, and this end: a share of all actions, at most half of that plan.
 
     Args:
@@ -56,8 +56,8 @@ def longest_cut(plans: AnyPlans, share: float) -> tuple[AnyPlans, AnyPlans]:
 
 
 def fair_split(
-    plans: AnyPlans, share: float, generator: torch.Generator | None = None, *, divide_groups: bool = False
-) -> tuple[AnyPlans, AnyPlans]:
+    plans: AnySequences, share: float, generator: torch.Generator | None = None, *, divide_groups: bool = False
+) -> tuple[AnySequences, AnySequences]:
     """Plans to learn from, and plans that are held out at random: about a share of all actions.
 
     Where groups, or plans without groups, are so unequal that those drawn are no such share, others are drawn. Where
@@ -141,7 +141,7 @@ def folds(plans: Sequences, number: int, seed: int = 0) -> list[tuple[Tensor, Te
     return [((drawn[unit] != fold).nonzero()[:, 0], (drawn[unit] == fold).nonzero()[:, 0]) for fold in range(number)]
 
 
-def in_parts(plans: Plans, number: int = BLOCKS) -> Plans:
+def in_parts(plans: AnyPlans, number: int = BLOCKS) -> AnyPlans:
     """A single plan cut into `number` consecutive plans of about the same length, for cross-validation in time.
 
     Args:
@@ -162,7 +162,7 @@ def in_parts(plans: Plans, number: int = BLOCKS) -> Plans:
     return pieces(plans, -(-length // number))
 
 
-def pieces(plans: Plans, most: int) -> Plans:
+def pieces(plans: AnyPlans, most: int) -> AnyPlans:
     """Plans cut into consecutive parts of at most `most` actions, in order; the parts belong to no group.
 
     Example:
@@ -176,12 +176,7 @@ def pieces(plans: Plans, most: int) -> Plans:
     first = (torch.arange(len(row), device=lengths.device) - (number.cumsum(0) - number)[row]) * most
     place = first[:, None] + torch.arange(min(most, plans.max_length), device=lengths.device)
     place = place.minimum((lengths[row, None] - 1).clamp(min=0))
-    parts = {name: getattr(plans, name) for name in ("actions", "durations", "context")}
+    parts = {name: getattr(plans, name) for name in plans.PER_ACTION}
     cut = {name: values[row[:, None], place] for name, values in parts.items() if values is not None}
-    return replace(
-        ungrouped(plans),
-        **cut,
-        lengths=(lengths[row] - first).clamp(max=most),
-        condition=None if plans.condition is None else plans.condition[row],
-        plan_names=None if plans.plan_names is None else tuple(plans.plan_names[number] for number in row.tolist()),
-    )
+    cut |= ungrouped(plans).select_rows(plans.PER_PLAN, row)
+    return replace(ungrouped(plans), **cut | {"lengths": (lengths[row] - first).clamp(max=most)})

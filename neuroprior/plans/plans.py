@@ -4,15 +4,14 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import log2
-from typing import Any
+from typing import Any, Self, TypeVar
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from neuroprior._checks import check_count, check_memory, check_range, check_sizes, is_integer
-from neuroprior.plans.columns import Columns, Missing, check_distinct, fields_of_events
-from neuroprior.plans.rows import check_readable, rows_of
+from neuroprior.plans.columns import check_distinct
 from neuroprior.plans.sequences import Sequences, expand_context
 
 MOST_BITS = 48
@@ -44,13 +43,6 @@ class Plans(Sequences):
         context_names: names of the context indices, numbered from 0, or None.
         group_names: names of the groups, numbered from 0, or None.
         end: the action that stands for the end of the plan (see `with_end`), or None. It may only be a plan's last.
-        durations: how long each action took, floating point `[N, L]`, stored as float32: at least 0, NaN where it is
-            not known; None for plans without times. The unit is the user's.
-        condition: integers `[N]`: what plans are compared by, such as the treatment of the subject; None for none.
-        condition_names: names of the conditions, numbered from 0, or None.
-        notes: what a reader of files has to say of them, a line each.
-        plan_names: N names, such as those of sessions, or None. The parts of a plan that was cut at gaps share its
-            name, and plans of different groups may have the same one.
 
     Raises:
         ValueError: a shape, dtype or value is wrong; the message says which and where.
@@ -75,17 +67,12 @@ class Plans(Sequences):
     context_names: Sequence[str] | None = None
     group_names: Sequence[str] | None = None
     end: int | None = None
-    durations: Tensor | None = None
-    condition: Tensor | None = None
-    condition_names: Sequence[str] | None = None
-    notes: Sequence[str] = ()
-    plan_names: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
         check_sizes(num_actions=self.num_actions)
         if self.num_actions > MOST_ACTIONS:
             raise ValueError(f"num_actions: at most {MOST_ACTIONS}, not {self.num_actions}; number the actions from 0")
-        actions = _tensor("actions", self.actions)
+        actions = as_numbers("actions", self.actions)
         if actions.dim() != 2:
             raise ValueError(f"`actions` must have shape [N, L], got {list(actions.shape)}")
         object.__setattr__(self, "actions", actions)
@@ -93,53 +80,27 @@ class Plans(Sequences):
             self._check_end(actions)
         num, length = actions.shape
         if self.lengths is not None:
-            lengths = _tensor("lengths", self.lengths)
-            _check_shape("lengths", lengths, (num,))
+            lengths = as_numbers("lengths", self.lengths)
+            check_shape("lengths", lengths, (num,))
             check_range("lengths", lengths, length + 1, "possible lengths")
             object.__setattr__(self, "lengths", lengths.long())
             actions = actions.masked_fill(~self.mask(), 0) if is_integer(actions) else actions
         check_range("actions", actions, self.num_actions, "actions")
         object.__setattr__(self, "actions", actions.to(action_dtype(self.num_actions)))
-        _check_texts("action_names", self.action_names)
-        _check_texts("notes", self.notes)
-        if self.action_names is not None and len(self.action_names) != self.num_actions:
+        if check_texts("action_names", self.action_names) and len(self.action_names or ()) != self.num_actions:
             raise ValueError(
-                f"`action_names` must be {self.num_actions} names, one an action, got {len(self.action_names)}"
+                f"`action_names` must be {self.num_actions} names, one an action, got {len(self.action_names or ())}"
             )
-        for what in ("group", "condition"):
-            if getattr(self, what) is not None:
-                values = _tensor(what, getattr(self, what))
-                object.__setattr__(self, what, values)
-                if not is_integer(values):
-                    raise ValueError(f"`{what}` must be integers, got {str(values.dtype).removeprefix('torch.')}")
-                _check_shape(what, values, (num,))
-        if self.durations is not None:
-            durations = _tensor("durations", self.durations)
-            _check_shape("durations", durations, (num, length))
-            if not durations.is_floating_point():
-                durations = durations.float()
-            wrong = ((durations < 0) | durations.isinf()) & self.mask()
-            if wrong.any():
-                where = wrong.nonzero()[0].tolist()
-                raise ValueError(
-                    f"`durations{where}` must be finite times from 0, got {float(durations[tuple(where)])}"
-                )
-            object.__setattr__(self, "durations", durations.float().masked_fill(~self.mask(), 0))
+        if self.group is not None:
+            object.__setattr__(self, "group", as_integers("group", self.group, num))
         if self.context is not None:
-            context = _tensor("context", self.context)
+            context = as_numbers("context", self.context)
             check_context(context, num, length)
             context = context.to(torch.int32) if has_patterns(context) else self._context_of_steps(context)
             object.__setattr__(self, "context", context)
-        for what in ("action", "context", "group", "condition"):
-            if _check_texts(f"{what}_names", getattr(self, f"{what}_names")):
-                check_distinct(f"{what}_names", getattr(self, f"{what}_names"))
-        if _check_texts("plan_names", self.plan_names):
-            if len(self.plan_names or ()) != num:
-                raise ValueError(f"`plan_names` must be {num}, one a plan, got {len(self.plan_names or ())}")
-            object.__setattr__(self, "plan_names", tuple(self.plan_names or ()))
-        _check_names("group", self.group, self.group_names)
-        _check_names("condition", self.condition, self.condition_names)
-        _check_names("context", self.context, self.context_names)
+        check_distinct("action_names", self.action_names)
+        check_numbered("group", self.group, self.group_names)
+        check_numbered("context", self.context, self.context_names)
 
     def _context_of_steps(self, context: Tensor) -> Tensor:
         """The context before each step; beyond a plan's length it is 0."""
@@ -166,100 +127,7 @@ class Plans(Sequences):
         taken = super().mask()
         return taken if end or self.end is None else taken & (self.actions != self.end)
 
-    def _names_of(self, index: Tensor | slice) -> dict[str, Any]:
-        if self.plan_names is None:
-            return {}
-        chosen = index if isinstance(index, slice) else torch.as_tensor(index).cpu()
-        return {"plan_names": tuple(self.plan_names[i] for i in torch.arange(len(self))[chosen].tolist())}
-
-    @classmethod
-    def from_dataframe(
-        cls,
-        frame: Any,
-        *,
-        action: str | None = None,
-        plan: str | None = None,
-        context: str | Sequence[str] | None = None,
-        group: str | None = None,
-        condition: str | None = None,
-        start: str | None = None,
-        stop: str | None = None,
-        duration: str | None = None,
-        event_type: str | None = None,
-        missing: Missing = "gap",
-        merge_repeats: bool = False,
-        max_gap: float | None = None,
-        num_actions: int | None = None,
-        action_names: Sequence[str] | None = None,
-    ) -> "Plans":
-        """Plans of a table of events, one action a row.
-
-        Whole numbers are indices, and other labels names, which are numbered in sorted order. Labels count without
-        space at their ends; a label that is empty, NaN, NA, N/A, null, ? or - is missing. What was noticed (gaps,
-        names that are nearly the same, columns without use) stands in `notes`.
-
-        Args:
-            frame: a pandas frame.
-            action, plan, context, group, condition, start, stop, duration, event_type: names of its columns, see
-                `Columns`; where one is not given, the column of that very name is taken, if there is one (but for
-                event_type).
-            missing: what rows without a label do: a "gap" ends the plan, and another one begins after it; as "label"
-                they count as an action, "missing"; "error" refuses them. Without groups the parts of a plan become one.
-            merge_repeats: take the same label in successive rows for one action, as in tables with a row a frame; its
-                context is that of the first of these rows, and it lasts as long as they do together, or as many rows as
-                they are where no times are known.
-            max_gap: a longer pause between the end of an action and the start of the next one ends the plan, too; in
-                the unit of `start` (seconds, for times of day and dates). An unknown end counts as the action's start.
-                None: no pause does.
-            num_actions: A; None: the number of names, else the largest action + 1.
-            action_names: A names in the order of their numbers; None: the names that occur, sorted.
-
-        Raises:
-            ValueError: a column is not there, or an entry is wrong; the message names the row.
-        """
-        columns = Columns(action, plan, context, group, condition, start, stop, duration, event_type)
-        fields = fields_of_events(
-            frame,
-            columns,
-            missing=missing,
-            merge_repeats=merge_repeats,
-            max_gap=max_gap,
-            num_actions=num_actions,
-            action_names=action_names,
-        )
-        return cls(**fields)
-
-    def to_dataframe(self) -> Any:
-        """A pandas frame of these plans, one action a row, which `from_dataframe` reads.
-
-        Columns: `plan` and `action`, names where there are any, else numbers; and, where the plans have them, `context`
-        (or `context_1`, `context_2`, ..., features), `group`, `condition` and `duration`. A row
-        without an action is between two parts of one plan.
-
-        `Plans.from_dataframe(frame, num_actions=...)`, or with `action_names=`, gives the same plans; other names
-        are numbered in sorted order then.
-
-        Raises:
-            ValueError: plans with an end symbol, with patterns, or of which one has no action; or a name that would
-                not be read as a name.
-            ImportError: pandas is not installed.
-        """
-        import pandas as pd
-
-        check_readable(self, "plans", "a frame")
-        if self.context is not None and has_patterns(self.context):
-            raise ValueError(f"plans: context: a frame cannot hold patterns {list(self.context.shape)}; write .npz")
-        lengths = self.mask().sum(1)
-        if not lengths.all():
-            raise ValueError(f"plans: plan {int((lengths == 0).nonzero()[0])} has no actions, and so no row")
-        header, *rows = rows_of(self, True)
-        cells = [[None if cell == "" else cell for cell in row] for row in rows]
-        frame = pd.DataFrame(cells, columns=header, dtype=object)
-        whole = frame.columns[frame.notna().all()]  # beside gaps pandas would make numbers of actions floats
-        frame[whole] = frame[whole].infer_objects()
-        return frame.astype({"duration": float}) if self.durations is not None else frame
-
-    def with_end(self, name: str = "end") -> "Plans":
+    def with_end(self, name: str = "end") -> Self:
         """The same plans, each closed by one action more, number A, that stands for the end of the plan.
 
         A prior that learns from them predicts when plans end, and samples plans of unequal lengths. The last context
@@ -284,6 +152,8 @@ class Plans(Sequences):
             context = torch.cat([context, torch.zeros_like(context[:, :1])], 1)
             context[torch.arange(len(self), device=context.device), lengths] = closing
         names = None if self.action_names is None else (*self.action_names, name)
+        more: dict[str, Any] = self.added_fields(self.PER_ACTION)
+        more = {name: functional.pad(values, (0, 1)) for name, values in more.items()}
         return replace(
             self,
             actions=actions,
@@ -292,10 +162,15 @@ class Plans(Sequences):
             action_names=names,
             context=context,
             end=self.num_actions,
-            durations=None if self.durations is None else functional.pad(self.durations, (0, 1)),
+            **more,
         )
 
-    def without_end(self) -> "Plans":
+    def added_fields(self, names: Sequence[str]) -> dict[str, Any]:
+        """Those of the fields of these names that the plans have and a subclass of `Plans` adds."""
+        values = {name: getattr(self, name) for name in names if name not in (*Plans.PER_PLAN, *Plans.PER_ACTION)}
+        return {name: each for name, each in values.items() if each is not None}
+
+    def without_end(self) -> Self:
         """The same plans without the end symbol, which must be the last action, and with their lengths.
 
         Raises:
@@ -315,15 +190,25 @@ class Plans(Sequences):
         )
         return opened.steps(stop=int(lengths.max())) if len(self) else opened
 
-    def without_context(self) -> "Plans":
+    def without_context(self) -> Self:
         """The same plans without their context."""
         return self if self.context is None else replace(self, context=None, context_names=None)
+
+
+AnyPlans = TypeVar("AnyPlans", bound=Plans)
 
 
 def check_are_plans(plans: object) -> None:
     """Raise ValueError for what is not `Plans`."""
     if not isinstance(plans, Plans):
         raise ValueError(f"`plans` must be Plans, as in Plans(actions, num_actions), got {type(plans).__name__}")
+
+
+def check_plain_plans(plans: Plans, place: object) -> None:
+    """Raise ValueError for plans of a subclass that have what `Plans` have no field for, and only `.npz` files hold."""
+    more = plans.added_fields((*plans.PER_PLAN, *plans.PER_ACTION))
+    if more:
+        raise ValueError(f"{place}: {', '.join(more)} of {type(plans).__name__} are written to .npz files only")
 
 
 def all_plans(num_actions: int, length: int) -> Tensor:
@@ -389,15 +274,6 @@ def check_context(context: Tensor, num_plans: int, length: int) -> None:
         raise ValueError(f"context{where}: {float(context[tuple(where)])} is not a finite number")
 
 
-def durations_of(plans: Plans) -> Tensor:
-    """The durations `[N, L]` of plans; ValueError where they have none."""
-    if plans.durations is None:
-        raise ValueError(
-            "durations: these plans have none; give Plans(durations=), or a file with start and stop times"
-        )
-    return plans.durations
-
-
 def has_patterns(context: Tensor | None) -> bool:
     """True for the context of plans that is several indices per step, `[N, L, F]`.
 
@@ -417,7 +293,7 @@ def check_patterns(patterns: Tensor) -> None:
     check_range("context", patterns, 2**31, "patterns")
 
 
-def _tensor(name: str, values: Any) -> Tensor:
+def as_numbers(name: str, values: Any) -> Tensor:
     """Numbers as a tensor; ValueError for names, and for rows of unequal lengths."""
     try:
         return torch.as_tensor(values)
@@ -428,25 +304,37 @@ def _tensor(name: str, values: Any) -> Tensor:
         ) from None
 
 
-def _check_shape(name: str, values: Tensor, shape: tuple[int, ...]) -> None:
+def as_integers(name: str, values: Any, num: int) -> Tensor:
+    """Integers `[num]`, one for each plan; ValueError for anything else."""
+    numbers = as_numbers(name, values)
+    if not is_integer(numbers):
+        raise ValueError(f"`{name}` must be integers, got {str(numbers.dtype).removeprefix('torch.')}")
+    check_shape(name, numbers, (num,))
+    return numbers
+
+
+def check_shape(name: str, values: Tensor, shape: tuple[int, ...]) -> None:
+    """Raise ValueError for a tensor of another shape."""
     if tuple(values.shape) != shape:
         raise ValueError(f"`{name}` must have shape {list(shape)}, got {list(values.shape)}")
 
 
-def _check_texts(what: str, names: Sequence[str] | None) -> bool:
+def check_texts(what: str, names: Sequence[str] | None) -> bool:
     """Whether there are names; ValueError unless they are texts, and names such as a file can hold."""
     if names is not None and (
         not isinstance(names, Sequence) or isinstance(names, str) or not all(isinstance(name, str) for name in names)
     ):
         raise ValueError(f"`{what}` must be a list of texts, got {names!r}")
-    for name in filter(HALF_PAIR.search, names or () if what != "notes" else ()):
+    for name in filter(HALF_PAIR.search, names or ()):
         raise ValueError(f"{what}: {name!r} has a broken character, half of a surrogate pair, which no file can hold")
     return names is not None
 
 
-def _check_names(what: str, numbers: Tensor | None, names: Sequence[str] | None) -> None:
-    if names is None:
+def check_numbered(what: str, numbers: Tensor | None, names: Sequence[str] | None) -> None:
+    """Raise ValueError unless names, where there are any, are different texts, one for each of the integers."""
+    if not check_texts(f"{what}_names", names) or names is None:
         return
+    check_distinct(f"{what}_names", names)
     if numbers is None or not is_integer(numbers):
         raise ValueError(f"`{what}_names` must come with the integers in {what} that they name")
     check_range(what, numbers, len(names), f"{what} names")

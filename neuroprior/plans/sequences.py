@@ -2,19 +2,16 @@
 
 import hashlib
 from abc import ABC
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from numbers import Integral, Real
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from neuroprior._checks import check_count, is_integer, is_number
 from neuroprior._random import generator_on
-
-PER_PLAN = ("actions", "lengths", "context", "group", "durations", "condition")
-"""Fields whose tensors have a row for each plan."""
 
 
 def check_index(index: object) -> None:
@@ -35,6 +32,12 @@ class Sequences(ABC):
         context: what is known before each action, `[N, L]` or `[N, L, C]`; None for no context.
         group: integers `[N]`: the plans of a group are not independent; None if each plan is independent.
     """
+
+    PER_PLAN: ClassVar[tuple[str, ...]] = ("lengths", "group")
+    """Fields with an entry for each plan, `[N]`: tensors, or texts. A subclass adds its own."""
+
+    PER_ACTION: ClassVar[tuple[str, ...]] = ("actions", "context")
+    """Fields whose tensors have an entry for each action of each plan, `[N, L, ...]`. A subclass adds its own."""
 
     actions: Tensor
     lengths: Tensor | None
@@ -76,13 +79,12 @@ class Sequences(ABC):
     def __getitem__(self, index: Tensor | slice) -> Self:
         """The plans at `index` (a slice, integers or a bool mask)."""
         check_index(index)
-        tensors = {name: getattr(self, name, None) for name in PER_PLAN}
-        picked = {name: values[index] for name, values in tensors.items() if values is not None}
-        return replace(self, **picked, **self._names_of(index))  # type: ignore[type-var]
+        return replace(self, **self.select_rows((*self.PER_PLAN, *self.PER_ACTION), index))  # type: ignore[type-var]
 
-    def _names_of(self, index: Tensor | slice) -> dict[str, Any]:
-        """The fields of the plans at `index` that are no tensors, where each plan has its own."""
-        return {}
+    def select_rows(self, names: Sequence[str], index: Tensor | slice) -> dict[str, Any]:
+        """The fields of these names that the plans have, each of the plans at `index` alone."""
+        values = {name: getattr(self, name) for name in names}
+        return {name: _rows(each, index) for name, each in values.items() if each is not None}
 
     def __iter__(self) -> Iterator[Self]:
         """Each plan, as plans of one."""
@@ -106,7 +108,7 @@ class Sequences(ABC):
         stop = self.max_length if stop is None else min(stop, self.max_length)
         if stop < min(first, self.max_length):
             raise ValueError(f"`stop` must be at least {first}, the first action, got {stop}")
-        parts = {name: getattr(self, name, None) for name in ("actions", "durations", "context")}
+        parts = {name: getattr(self, name) for name in self.PER_ACTION}
         cut = {name: values[:, first:stop] for name, values in parts.items() if values is not None}
         if self.lengths is not None:
             cut["lengths"] = (self.lengths - first).clamp(0, max(stop - first, 0))
@@ -142,6 +144,15 @@ class Sequences(ABC):
         chosen[order[:held_out]] = True
         index = chosen[unit].to(self.actions.device)
         return self[~index], self[index]
+
+
+def _rows(values: Tensor | Sequence[str], index: Tensor | slice) -> Tensor | Sequence[str]:
+    """The entries at `index` of a tensor, or of texts."""
+    if isinstance(values, Tensor):
+        return values[index]
+    if isinstance(index, slice):
+        return tuple(values)[index]
+    return tuple(values[i] for i in torch.arange(len(values))[torch.as_tensor(index).cpu()].tolist())
 
 
 def is_per_plan(context: Tensor) -> bool:
@@ -189,11 +200,9 @@ def check_validation(share: object) -> None:
 
 
 def plans_digest(plans: Sequences) -> str:
-    """A digest of all that plans hold but the notes of their reader, which files do not keep."""
+    """A digest of all that plans hold."""
     digest = hashlib.sha256()
     for name, value in vars(plans).items():
-        if name == "notes":
-            continue
         if isinstance(value, Tensor):
             digest.update(f"{name} {value.dtype} {[*value.shape]}".encode())
             digest.update(value.cpu().contiguous().numpy().tobytes())

@@ -34,15 +34,15 @@ class Posterior:
     plans: Plans
 
     def to_frame(self) -> Any:
-        """A pandas frame: `plan`, `group` (where there are any), `step` (0 up to the plan's length), `intention`,
-        `probability`."""
+        """A pandas frame: `plan`, `group` and whatever else a plan has one of, `step` (0 up to the plan's length),
+        `intention`, `probability`."""
         plans = self.plans
         lengths = plans.mask().sum(1).cpu()
         there = torch.arange(self.log_probs.shape[1]) <= lengths[:, None]
         plan, step, which = there[:, :, None].expand_as(self.log_probs).nonzero(as_tuple=True)
-        about = plan_frame(plans).drop(columns="condition", errors="ignore")
         return (
-            about.iloc[plan.numpy()]
+            plan_frame(plans)
+            .iloc[plan.numpy()]
             .assign(
                 step=step.tolist(),
                 intention=[self.names[k] for k in which.tolist()],

@@ -1,13 +1,11 @@
 """The plans that a prior learns from, counts in or is chosen on: checked, and without a context it does not take."""
 
-import sys
-import warnings
-
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_same_names, is_integer
+from neuroprior._checks import check_same_names, is_integer, warn_caller
 from neuroprior.plans import Plans, constant_context
+from neuroprior.plans.plans import AnyPlans
 from neuroprior.priors.prior import Prior, check_actions
 
 MOST_NEW, FEWEST_PLANS = 0.9, 20
@@ -89,7 +87,7 @@ def counted_plans(prior: Prior, plans: Plans | Tensor) -> Plans:
     return plans
 
 
-def plans_for(prior: Prior, plans: Plans) -> Plans:
+def plans_for(prior: Prior, plans: AnyPlans) -> AnyPlans:
     """`plans` without a context that the prior does not take."""
     return plans if prior.takes_context else plans.without_context()
 
@@ -104,23 +102,15 @@ def _warn_of_context(prior: Prior, plans: Plans) -> None:
     if plans.context is None:
         return
     if not prior.takes_context:
-        _warn(
+        warn_caller(
             f"{type(prior).__name__}: it ignores the context of the plans; make it with num_contexts= or"
             " context_size=, if it takes these, or leave the context out (plans.without_context())"
         )
     elif prior.num_contexts is not None and is_integer(plans.context) and _seldom_repeats(prior, plans):
-        _warn(
+        warn_caller(
             f"{type(prior).__name__}: nearly every context occurs in one plan alone, so that nothing is learned from"
             " it; where it is no category, give features (a floating point context, or Features(size) in a world)"
         )
-
-
-def _warn(message: str) -> None:
-    """Warn where the library was called from."""
-    frame, level = sys._getframe(1), 2
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("neuroprior."):
-        frame, level = frame.f_back, level + 1
-    warnings.warn(message, stacklevel=level)
 
 
 def _seldom_repeats(prior: Prior, plans: Plans) -> bool:

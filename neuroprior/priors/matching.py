@@ -8,17 +8,16 @@ from torch import Tensor
 
 from neuroprior.plans import Plans
 from neuroprior.plans.columns import listed
-from neuroprior.plans.plans import check_are_plans
+from neuroprior.plans.plans import AnyPlans, check_are_plans
 from neuroprior.priors.learning import plans_for
 from neuroprior.priors.prior import Prior, as_actions
 
 
-def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
+def match_plans(plans: AnyPlans, prior: Prior, name: str = "prior") -> AnyPlans:
     """Plans as a prior that was fitted elsewhere can score them.
 
     Actions and contexts are renumbered by their names, where both the plans and the prior have names; the context is
-    left out for a prior without one, and an end symbol is added for a prior that has one. The durations of past actions
-    become features for a prior that was trained with them.
+    left out for a prior without one, and an end symbol is added for a prior that has one.
 
     Args:
         plans: N plans without an end symbol; or with that of the prior, whose actions are then numbered as the prior's.
@@ -26,7 +25,7 @@ def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
         name: of the prior, for messages.
 
     Raises:
-        ValueError: the prior does not know one of the actions or contexts, or takes durations that plans do not have.
+        ValueError: the prior does not know one of the actions or contexts.
 
     Example:
         >>> prior = MarkovPrior(2, 0).fit(Plans(torch.tensor([[0, 1]]), 2, action_names=("rest", "walk")))
@@ -40,16 +39,13 @@ def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
                 f"{name}: its end symbol is {prior.end} of {prior.num_actions} actions, and that of the plans"
                 f" {plans.end} of {plans.num_actions}; give plans.without_end()"
             )
-        plans = plans_for(prior, plans)
-        return plans if prior.past_durations is None else prior.past_durations.added_to(plans)
+        return plans_for(prior, plans)
     known = prior.num_actions - (prior.end is not None)
     if plans.num_actions > known:
         raise ValueError(f"`{name}` must know at least the {plans.num_actions} actions of the plans, got {known}")
     plans = renumbered(plans, known, learned_names(prior), prior.context_names, name)
-    if not prior.takes_context:
-        plans = plans.without_context()
-    plans = plans if prior.end is None else plans.with_end()
-    return plans if prior.past_durations is None else prior.past_durations.added_to(plans)
+    plans = plans_for(prior, plans)
+    return plans if prior.end is None else plans.with_end()
 
 
 def decode(plans: Plans | Tensor, prior: Prior | None = None) -> list[list[str]]:
@@ -86,8 +82,8 @@ def learned_names(prior: Prior) -> list[str] | None:
 
 
 def renumbered(
-    plans: Plans, num_actions: int, names: Sequence[str] | None, context_names: Sequence[str] | None, where: str
-) -> Plans:
+    plans: AnyPlans, num_actions: int, names: Sequence[str] | None, context_names: Sequence[str] | None, where: str
+) -> AnyPlans:
     """The plans with actions and contexts numbered as in these names; as they are where one side has no names.
 
     Raises:
@@ -115,7 +111,7 @@ def numbers(known: Sequence[str], names: Sequence[str], before: str, after: str)
     return torch.tensor([known.index(name) for name in names])
 
 
-def with_contexts_of(prior: Prior, plans: Plans, is_table: bool) -> tuple[Plans, list[str]]:
+def with_contexts_of(prior: Prior, plans: AnyPlans, is_table: bool) -> tuple[AnyPlans, list[str]]:
     """The plans, whose contexts have names if they are numbers in a table that are names of the prior; and notes.
 
     Args:

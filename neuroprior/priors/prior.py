@@ -2,7 +2,6 @@
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
 from typing import Any, ClassVar, Literal, Self
 
 import torch
@@ -10,7 +9,6 @@ from torch import Tensor
 
 from neuroprior._checks import check_memory, check_range, check_same_names, check_sizes, is_integer, kind_of
 from neuroprior.plans import Plans, check_context, check_patterns, has_patterns
-from neuroprior.plans.past_durations import PastDurations
 from neuroprior.plans.sequences import is_per_plan
 from neuroprior.priors.saved import SavedModule
 from neuroprior.sampling import ancestral as sampling
@@ -43,8 +41,6 @@ class Prior(SavedModule):
             None. After it, it has probability 1 in `log_prob` and in samples.
         action_names, context_names: names of the actions and contexts, as they were in these plans, or None.
         has_learned: whether the prior has learned from plans, so that these attributes are theirs.
-        past_durations: how the durations of the last actions became features of the context in training, or None;
-            `neuroprior.priors.match_plans` then adds the same features to other plans. The caller of `fit` sets it.
 
     Raises:
         ValueError: an argument is out of range.
@@ -78,7 +74,6 @@ class Prior(SavedModule):
         self.has_learned = False
         self.action_names: tuple[str, ...] | None = None
         self.context_names: tuple[str, ...] | None = None
-        self.past_durations: PastDurations | None = None
         self.register_buffer("_anchor", torch.zeros(()), persistent=False)
 
     @property
@@ -112,8 +107,7 @@ class Prior(SavedModule):
     def learned(self) -> dict[str, Any]:
         """What `fit` found that is neither weights nor an argument (JSON values); saved with the prior."""
         names = {"action_names": self.action_names, "context_names": self.context_names}
-        past = {} if self.past_durations is None else {"past_durations": asdict(self.past_durations)}
-        return {"context_per": self.context_per, "end": self.end} | names | past
+        return {"context_per": self.context_per, "end": self.end} | names
 
     @property
     def fit_settings(self) -> tuple[str, ...]:
@@ -136,8 +130,6 @@ class Prior(SavedModule):
         self.end = end
         self.action_names = _names("action_names", learned, self.num_actions)
         self.context_names = _names("context_names", learned, self.num_contexts or 0)
-        past = learned.get("past_durations")
-        self.past_durations = None if past is None else PastDurations(**past)
 
     @abstractmethod
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Any]:

@@ -6,7 +6,7 @@
 import hashlib
 from math import log
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,22 +20,23 @@ LEARNED = "learned.json"
 """In the folder of a saved prior: the digests of the plans that it has learned from, at least in part."""
 
 
-def score(prior: Prior, plans: Plans, by: Literal["plan", "group", "condition", "action"] = "plan") -> Any:
-    """The log-likelihood of plans under a prior, summed by plan, group, condition or action.
+def score(prior: Prior, plans: Plans, by: str = "plan") -> Any:
+    """The log-likelihood of plans under a prior, summed by plan, by action, or by group.
 
     Args:
         prior: fitted.
         plans: N of them; their actions and contexts are matched by name, where both have names (not in plans with the
             end symbol of the prior, see `match_plans`).
-        by: what a row is.
+        by: what a row is: "plan", "action", "group", or what else a subclass of `Plans` has for each plan, such as
+            "condition".
 
     Returns:
-        A pandas frame: `by`; `plans` and `actions`, how many (of a plan `actions` alone, its name (without names its
-        number), and its `group` and `condition`, where there are any); `log_likelihood`, nats; `bits_per_action`. The
-        likelihood of a plan's end, where the prior predicts it, counts for the plan, not for an action.
+        A pandas frame: `by`; `plans` and `actions`, how many (of a plan `actions` alone, its number, and its `group`
+        and whatever else it has one of); `log_likelihood`, nats; `bits_per_action`. The likelihood of a plan's end,
+        where the prior predicts it, counts for the plan, not for an action.
 
     Raises:
-        ValueError: the prior does not know the actions or contexts, or plans have no groups or conditions.
+        ValueError: the prior does not know the actions or contexts, or plans have no groups.
 
     Example:
         >>> plans = Plans(torch.tensor([[0, 1, 2], [2, 1, 0]]), 3, group=torch.tensor([0, 1]))
@@ -56,9 +57,10 @@ def scores_by(bits: Tensor, plans: Plans, by: str) -> Any:
     """The frame of `score` from the bits `[N, L]`, or `[N, L + 1]` with those of a plan's end, of each action."""
     import pandas as pd
 
-    if by not in ("plan", "group", "condition", "action"):
-        raise ValueError(f"`by` must be one of plan, group, condition, action, got {by!r}")
-    if by in ("group", "condition") and getattr(plans, by) is None:
+    units = ("plan", "action", *_units_of(plans))
+    if by not in units:
+        raise ValueError(f"`by` must be one of {', '.join(units)}, got {by!r}")
+    if by in units[2:] and getattr(plans, by) is None:
         raise ValueError(f"by: the plans have no {by}")
     mask = plans.mask()
     if by == "action":
@@ -78,20 +80,23 @@ def scores_by(bits: Tensor, plans: Plans, by: str) -> Any:
 
 
 def plan_frame(plans: Plans) -> Any:
-    """A pandas frame with a row a plan: `plan`, and `group` and `condition` where there are any; names, or numbers."""
+    """A pandas frame with a row a plan: its number `plan`, its `group` and whatever else it has one of, by name."""
     import pandas as pd
 
-    own = {what: _names(plans, what) for what in ("group", "condition")}
-    return pd.DataFrame(
-        {"plan": plans.plan_names or range(len(plans))}
-        | {what: names for what, names in own.items() if names is not None}
-    )
+    own = {what: _names(plans, what) for what in _units_of(plans) if getattr(plans, what) is not None}
+    return pd.DataFrame({"plan": range(len(plans))} | own)
 
 
-def _names(plans: Plans, what: str) -> list[Any] | None:
-    """The group or the condition of each plan, by name where it has one."""
-    numbers, names = getattr(plans, what), getattr(plans, f"{what}_names")
-    return None if numbers is None else [number if names is None else names[number] for number in numbers.tolist()]
+def _units_of(plans: Plans) -> list[str]:
+    """What each plan can have one of."""
+    return [what for what in plans.PER_PLAN if what != "lengths"]
+
+
+def _names(plans: Plans, what: str) -> list[Any]:
+    """The group of each plan, say, by name where it has one."""
+    values, names = getattr(plans, what), getattr(plans, f"{what}_names", None)
+    numbers = values.tolist() if isinstance(values, Tensor) else values
+    return [number if names is None else names[number] for number in numbers]
 
 
 def plan_digests(plans: Plans) -> list[str]:

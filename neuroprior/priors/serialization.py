@@ -29,7 +29,7 @@ T = TypeVar("T", bound=SavedModule)
 
 
 def save(prior: SavedModule, folder: str | os.PathLike[str]) -> Path:
-    """Save a prior or a model of durations to a folder, made if need be.
+    """Save a prior to a folder, made if need be.
 
     Its files are `model.safetensors` (weights or counts) and `config.json`. Both are written under temporary names and
     renamed when they are whole.

@@ -10,6 +10,7 @@ from scipy import stats
 from torch import Tensor
 
 from neuroprior.behaviour import DurationModel, SemiMarkovPrior
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.plans import Plans, folds
 from neuroprior.priors import GRUPrior, MarkovPrior, fit, load, save
 from neuroprior.testing import check_prior
@@ -33,7 +34,7 @@ def draw(law: str, number: int, seed: int = 0) -> Tensor:
 
 def of_one_action(times: Tensor | list[float], num_plans: int = 10, **more: object) -> Plans:
     times = torch.as_tensor(times, dtype=torch.double).view(num_plans, -1)
-    return Plans(torch.zeros(times.shape, dtype=torch.long), 1, durations=times, **more)
+    return RecordedPlans(torch.zeros(times.shape, dtype=torch.long), 1, durations=times, **more)
 
 
 def transitions(num_plans: int = 40, times: float = 2.0, seed: int = 0, num_actions: int = 3) -> Plans:
@@ -41,7 +42,7 @@ def transitions(num_plans: int = 40, times: float = 2.0, seed: int = 0, num_acti
     actions = torch.randint(3, (num_plans, 60), generator=seeded(seed))
     durations = draw("gamma", num_plans * 60, seed).view(num_plans, 60)
     durations[:, :-1] *= 1 + (times - 1) * ((actions[:, :-1] == 0) & (actions[:, 1:] == 1))
-    return Plans(actions, num_actions, durations=durations)
+    return RecordedPlans(actions, num_actions, durations=durations)
 
 
 def test_the_likelihood_of_an_exponential_in_closed_form():
@@ -82,7 +83,7 @@ def test_each_action_has_its_own_law():
     kinds = ["weibull", "exponential", "lognormal"]
     actions = torch.arange(3).repeat(50, 20)
     durations = torch.stack([draw(law, 1000, seed) for seed, law in enumerate(kinds)], 1).view(50, 60)
-    model = DurationModel(3).fit(Plans(actions, 3, durations=durations))
+    model = DurationModel(3).fit(RecordedPlans(actions, 3, durations=durations))
     assert [row.law for row in model.table()] == kinds
     assert all(row.next_action is None for row in model.table())
 
@@ -101,7 +102,7 @@ def test_durations_that_depend_on_the_next_action():
 def test_the_last_action_of_a_plan_has_no_next_one():
     """Its law is that of the action; and the law of a transition is taken at the right step."""
     model = DurationModel(3, ["gamma"]).fit(transitions())
-    plans = Plans(torch.tensor([[2, 0, 1, 0]] * 2), 3, torch.tensor([4, 2]), durations=torch.full((2, 4), 5.0))
+    plans = RecordedPlans(torch.tensor([[2, 0, 1, 0]] * 2), 3, torch.tensor([4, 2]), durations=torch.full((2, 4), 5.0))
     found = model.log_prob(plans)
     rows = {(row.action, row.next_action): stats.gamma(row.parameters["shape"], scale=row.parameters["scale"])
             for row in model.table()}  # fmt: skip
@@ -133,12 +134,12 @@ def test_unknown_durations_are_left_out():
     times = draw("gamma", 1000).view(10, 100)
     missing = torch.rand(10, 100, generator=seeded(0)) < 0.3
     actions = torch.zeros(10, 100, dtype=torch.long)
-    some = DurationModel(1).fit(Plans(actions, 1, durations=times.masked_fill(missing, nan)))
-    alone = Plans(actions, 1, (~missing).sum(1), durations=torch.nn.utils.rnn.pad_sequence(
+    some = DurationModel(1).fit(RecordedPlans(actions, 1, durations=times.masked_fill(missing, nan)))
+    alone = RecordedPlans(actions, 1, (~missing).sum(1), durations=torch.nn.utils.rnn.pad_sequence(
         [row[~gone] for row, gone in zip(times, missing, strict=True)], batch_first=True
     ).new_zeros(10, 100).masked_scatter(torch.arange(100) < (~missing).sum(1)[:, None], times[~missing]))  # fmt: skip
     assert some.table() == DurationModel(1).fit(alone).table()
-    assert (some.log_prob(Plans(actions, 1, durations=times.masked_fill(missing, nan))) == 0).equal(missing)
+    assert (some.log_prob(RecordedPlans(actions, 1, durations=times.masked_fill(missing, nan))) == 0).equal(missing)
 
 
 def test_point_events():
@@ -146,7 +147,7 @@ def test_point_events():
     actions = torch.tensor([[0, 1, 2] * 20] * 10)
     durations = draw("gamma", 600).view(10, 60).masked_fill(actions == 0, 0)
     durations[(actions == 1) & (torch.arange(60) % 4 == 0)] = 0
-    plans = Plans(actions, 3, durations=durations)
+    plans = RecordedPlans(actions, 3, durations=durations)
     model = DurationModel(3).fit(plans)
     assert [row.zero for row in model.table()] == [1, 0.25, 0]
     found = model.log_prob(plans)
@@ -154,7 +155,7 @@ def test_point_events():
     assert torch.allclose(found[(actions == 1) & (durations == 0)], torch.tensor(log(0.25)).double())
     assert bool(found.isfinite().all())
     assert model.cdf(1, torch.tensor([0.0])).item() == 0.25
-    never = Plans(actions, 3, durations=torch.where(actions == 2, 0.0, 1.0))
+    never = RecordedPlans(actions, 3, durations=torch.where(actions == 2, 0.0, 1.0))
     assert model.log_prob(never)[actions != 1].tolist() == [-inf] * 400
     samples = model.sample(torch.arange(3).repeat(20000, 1), generator=seeded(0))
     zeros = (samples == 0).sum(0).tolist()
@@ -185,7 +186,7 @@ def test_actions_with_few_durations_have_the_law_of_all():
     actions[0, 0] = 2
     durations = draw("weibull", 60).view(10, 6)
     durations[:, 1] = nan
-    model = DurationModel(4).fit(Plans(actions, 4, durations=durations))
+    model = DurationModel(4).fit(RecordedPlans(actions, 4, durations=durations))
     rows = model.table()
     assert [row.number for row in rows] == [0, 40, 0, 0]
     assert rows[0][2:] == rows[2][2:] == rows[3][2:]
@@ -200,7 +201,7 @@ def test_few_durations_of_an_action_say_little_of_how_many_are_0():
     durations = draw("gamma", 39).view(3, 13)
     durations[(torch.arange(39).view(3, 13) % 4 == 0) & (actions != 2)] = 0
     zeros = int((durations == 0).sum())
-    rows = DurationModel(4).fit(Plans(actions, 4, durations=durations)).table()
+    rows = DurationModel(4).fit(RecordedPlans(actions, 4, durations=durations)).table()
     assert [row.zero for row in rows] == pytest.approx([0.25, zeros / 39, 0, zeros / 39])
 
 
@@ -224,7 +225,7 @@ def test_a_law_is_worth_its_parameters():
     gamma = torch.distributions.Gamma(shape, torch.ones_like(shape))
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        plans = Plans(actions, 30, durations=gamma.sample())
+        plans = RecordedPlans(actions, 30, durations=gamma.sample())
     scores = torch.stack([held_out(law, plans) for law in KNOWN]).flatten(1)
     sums = torch.zeros(len(KNOWN), 30, dtype=torch.double).index_add_(1, actions.flatten(), scores)
     best = (sums - 2 * torch.tensor([*KNOWN.values()])[:, None]).argmax(0)
@@ -241,7 +242,7 @@ def test_transitions_are_worth_their_parameters():
         plans = transitions(20, times, seed)
         plans = replace(plans, actions=plans.actions[:, :21], durations=plans.durations[:, :21])
         pair = plans.actions[:, :-1] * 3 + plans.actions[:, 1:]
-        each = held_out("gamma", Plans(pair, 9, durations=plans.durations[:, :-1]))
+        each = held_out("gamma", RecordedPlans(pair, 9, durations=plans.durations[:, :-1]))
         gain = each - held_out("gamma", plans)[:, :-1]
         price = 2 * 2 * 3
         own = [float(gain[plans.actions[:, :-1] == action].sum()) for action in range(3)]
@@ -294,7 +295,7 @@ def test_a_semi_markov_prior_is_its_action_prior_with_durations():
 
 
 def test_saved_and_loaded_bit_for_bit(tmp_path):
-    named = Plans(transitions().actions, 3, action_names=("a", "b", "c"), durations=transitions().durations)
+    named = RecordedPlans(transitions().actions, 3, action_names=("a", "b", "c"), durations=transitions().durations)
     prior = SemiMarkovPrior(3, laws=["gamma", "lognormal"]).fit(named)
     again = load(save(prior, tmp_path))
     assert repr(again) == repr(prior)

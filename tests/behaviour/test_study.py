@@ -4,8 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from neuroprior import Plans
 from neuroprior.behaviour import simulated_study
+from neuroprior.behaviour.tables import plans_of_frame
 
 
 def followed(study, first, second, treatment):
@@ -56,7 +56,7 @@ def test_designs(within) -> None:
     sessions = study.groupby(["animal", "session"]).treatment
     assert (sessions.nunique() == 1).all()
     assert (sessions.first() == "drug").sum() == 12
-    plans = Plans.from_dataframe(study, action="behaviour", plan="session", group="animal", condition="treatment")
+    plans = plans_of_frame(study, {"action": "behaviour", "plan": "session", "group": "animal"})
     assert plans.durations is not None
     assert len(plans.group.unique()) == 12
 

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 
-from neuroprior import Plans
-from neuroprior.plans import read_plans, write_plans
+from neuroprior.behaviour.report import ReadOptions
+from neuroprior.behaviour.tables import plans_of_frame, read_events
+from neuroprior.plans import read_plans
 from tests.support.sources import refuses
 
 LAB = """animal,session,behaviour,t,seconds,drug,observer,arena
@@ -26,7 +26,7 @@ COLUMNS = {"action": "behaviour", "plan": "session", "group": "animal", "conditi
 
 def read(tmp_path, text, name="lab.csv", **options):
     (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
-    return read_plans(tmp_path / name, **options)
+    return read_events(tmp_path / name, **options)
 
 
 def listed(plans):
@@ -44,7 +44,7 @@ def known(durations):
 def test_a_table_of_a_laboratory(tmp_path):
     """All that is read of it; and a frame is read as its file."""
     file = read(tmp_path, LAB, columns=COLUMNS | {"start": "t", "duration": "seconds"})
-    frame = Plans.from_dataframe(pd.read_csv(tmp_path / "lab.csv"), start="t", duration="seconds", **COLUMNS)
+    frame = plans_of_frame(pd.read_csv(tmp_path / "lab.csv"), COLUMNS | {"start": "t", "duration": "seconds"})
     for plans in (file, frame):
         assert listed(plans) == [["walk", "Rear"], ["walk"], ["rear"], ["groom", "walk"]]
         assert [plans.group_names[g] for g in plans.group] == ["m1", "m1", "m1", "m2"]
@@ -194,7 +194,7 @@ def test_what_is_read(tmp_path, text, options, actions, durations, notes):
     assert durations is None or known(plans.durations)[: len(durations)] == durations
     assert set(notes) <= set(plans.notes)
     if "plan,action,start,stop" in text:
-        frame = Plans.from_dataframe(pd.read_csv(tmp_path / "lab.csv"), **options)
+        frame = plans_of_frame(pd.read_csv(tmp_path / "lab.csv"), **options)
         assert (listed(frame), frame.notes) == (actions, plans.notes)
 
 
@@ -297,7 +297,7 @@ def test_what_is_refused(text, options, words, tmp_path):
 @pytest.mark.parametrize("name", ["a.jsonl", "a.npz"])
 def test_columns_are_for_tables(tmp_path, name):
     with refuses("columns", "CSV"):
-        read(tmp_path, "x", name, columns={"action": "b"})
+        ReadOptions(columns={"action": "b"}).read(str(tmp_path / name))
 
 
 @pytest.mark.parametrize("path", [None, 3, b"a.csv", pd.DataFrame()])
@@ -319,25 +319,25 @@ def test_frames_of_pandas():
     """Missing values of all kinds; whole numbers become floating point where one of them is missing."""
     frame = pd.DataFrame({"action": ["a", None, "b", np.nan, pd.NA, "c"]})
     for one in (frame, frame.astype("category")):
-        assert listed(Plans.from_dataframe(one)) == [["a"], ["b"], ["c"]]
+        assert listed(plans_of_frame(one)) == [["a"], ["b"], ["c"]]
     frame = pd.DataFrame({"action": [2.0, np.nan, 0.0], "context": [1.0, 3.0, 0.0], "group": [7.0, 7.0, 7.0]})
-    plans = Plans.from_dataframe(frame)
+    plans = plans_of_frame(frame)
     assert (listed(plans), plans.context.tolist(), plans.group.tolist()) == ([[2], [0]], [[1], [0]], [7, 7])
-    numbers = Plans.from_dataframe(pd.DataFrame({"action": [0, 1]}), num_actions=5)
+    numbers = plans_of_frame(pd.DataFrame({"action": [0, 1]}), num_actions=5)
     assert (numbers.num_actions, numbers.notes) == (5, ())
     with refuses("pandas frame", "dict"):
-        Plans.from_dataframe({"action": ["a"]})
+        plans_of_frame({"action": ["a"]})
     numbered = pd.DataFrame([["x", "a"], ["x", "b"]])
-    assert Plans.from_dataframe(numbered, action=1, plan=0).actions.tolist() == [[0, 1]]
+    assert plans_of_frame(numbered, {"action": 1, "plan": 0}).actions.tolist() == [[0, 1]]
     twice = pd.DataFrame([[1, "a", "x", "y"], [1, "b", "x", "y"]], columns=["plan", "action", "note", "note"])
-    assert Plans.from_dataframe(twice).notes == ("columns that are not used: note, note",)
-    broken = pd.DataFrame({"action": ["a", "b"], "x\ud800": [1, 2]})
-    assert any("not used" in note for note in Plans.from_dataframe(broken).notes)
+    assert plans_of_frame(twice).notes == ("columns that are not used: note, note",)
+    broken = pd.DataFrame([["a", 1], ["b", 2]], columns=pd.Index(["action", "x\ud800"], dtype=object))
+    assert any("not used" in note for note in plans_of_frame(broken).notes)
 
 
 def of_times(starts, stops=None):
     frame = pd.DataFrame({"action": list("abab")[: len(starts)], "plan": 1, "start": starts})
-    return Plans.from_dataframe(frame if stops is None else frame.assign(stop=stops))
+    return plans_of_frame(frame if stops is None else frame.assign(stop=stops))
 
 
 DATES = ["2024-01-05 10:00:00", "2024-01-05 10:00:10", "2024-01-05 10:01:00"]
@@ -385,12 +385,12 @@ def test_times_that_go_back_a_little_are_only_put_in_order():
 def test_frames_are_merged_to_actions():
     """A run takes as many rows as it has, or as long as these; what a gap parts is not merged."""
     frame = pd.DataFrame({"name": list("xxxxxxyy"), "syllable": [3, 3, 0, 0, 0, 3, 3, 3]})
-    plans = Plans.from_dataframe(frame, plan="name", action="syllable", merge_repeats=True)
+    plans = plans_of_frame(frame, {"plan": "name", "action": "syllable"}, merge_repeats=True)
     assert (listed(plans), plans.durations.tolist()) == ([[3, 0, 3], [3]], [[2, 3, 1], [2, 0, 0]])
-    timed = Plans.from_dataframe(frame.assign(duration=0.5), plan="name", action="syllable", merge_repeats=True)
+    timed = plans_of_frame(frame.assign(duration=0.5), {"plan": "name", "action": "syllable"}, merge_repeats=True)
     assert timed.durations.tolist() == [[1, 1.5, 0.5], [1, 0, 0]]
     gaps = pd.DataFrame({"plan": [1, 1, 1, 1, 1, 2], "action": ["a", "a", None, "a", "b", "b"]})
-    plans = Plans.from_dataframe(gaps, merge_repeats=True)
+    plans = plans_of_frame(gaps, merge_repeats=True)
     assert (listed(plans), plans.group.tolist()) == ([["a"], ["a", "b"], ["b"]], [0, 0, 1])
     assert plans.durations.tolist() == [[2, 0], [1, 1], [1, 0]]
 
@@ -398,10 +398,10 @@ def test_frames_are_merged_to_actions():
 def test_contexts_are_names_indices_or_features(tmp_path):
     """Decimal commas count where semicolons part the columns; a comma in names stays one."""
     frame = pd.DataFrame({"action": list("ab"), "speed": [1, 2.5], "turn": ["0", "-1"]})
-    assert Plans.from_dataframe(frame, context=["speed", "turn"]).context.tolist() == [[[1, 0], [2.5, -1]]]
-    assert Plans.from_dataframe(frame, context="speed").context.tolist() == [[[1], [2.5]]]
+    assert plans_of_frame(frame, {"context": ["speed", "turn"]}).context.tolist() == [[[1, 0], [2.5, -1]]]
+    assert plans_of_frame(frame, {"context": "speed"}).context.tolist() == [[[1], [2.5]]]
     with refuses("`columns.context` must be one of", "'speed,turn' (several are given as '[speed,turn]')"):
-        Plans.from_dataframe(frame, context="speed,turn")
+        plans_of_frame(frame, {"context": "speed,turn"})
     numbers = read(tmp_path, "plan;action;context\n0;a;0,64\n1;a;0,04\n2;a;1\n").context
     assert numbers.flatten().tolist() == pytest.approx([0.64, 0.04, 1.0])
     assert not read(tmp_path, "plan;action;context\n0;a;0,64\n1;a;0,04 m\n").context.is_floating_point()
@@ -420,27 +420,6 @@ def test_doses_changes_and_days_are_conditions(tmp_path):
 
 def test_numbers_of_groups_are_numbers(tmp_path):
     assert read(tmp_path, "group,plan,action\n01,a,x\n1,b,y\n01,c,y\n2,d,x\n").group.tolist() == [1, 1, 1, 2]
-
-
-def test_durations_and_conditions_stay_with_their_plans():
-    times, condition = torch.tensor([[1.0, 2], [3, 9]]), torch.tensor([0, 1])
-    plans = Plans(torch.tensor([[0, 1], [1, 0]]), 2, torch.tensor([2, 1]), durations=times, condition=condition)
-    assert plans.durations.tolist() == [[1, 2], [3, 0]]
-    assert plans[1:].durations.tolist() == [[3, 0]]
-    assert plans[torch.tensor([1])].condition.tolist() == [1]
-    closed = plans.with_end()
-    assert closed.durations.tolist() == [[1, 2, 0], [3, 0, 0]]
-    assert closed.without_end().durations.tolist() == [[1, 2], [3, 0]]
-    first, last = plans[:1].split(0.5)
-    assert (first.durations.tolist(), last.durations.tolist()) == ([[1]], [[2]])
-    for fields, words in (
-        ({"durations": torch.tensor([[1.0, -1], [1, 1]])}, "durations[0, 1]"),
-        ({"durations": torch.tensor([[1.0, torch.inf], [1, 1]])}, "durations[0, 1]"),
-        ({"durations": torch.ones(2)}, "`durations` must have shape"),
-        ({"condition": torch.tensor([0.5, 1])}, "condition"),
-    ):
-        with refuses(words):
-            Plans(plans.actions, 2, **fields)
 
 
 @pytest.mark.parametrize("first", ["sep=;", "sep=;;", '"sep=;"', "SEP=;"])
@@ -482,59 +461,6 @@ def test_what_is_above_the_header_is_not_read(tmp_path, above):
     assert read(tmp_path, semicolons, columns=columns).durations[0, 0] == 2.5
 
 
-def test_parts_of_a_plan_that_no_group_holds_together_are_written_as_plans(tmp_path):
-    """Else they would be read as one plan with a gap, whose parts form a group."""
-    plans = Plans(torch.tensor([[0, 1], [1, 1], [1, 0]]), 2, plan_names=("a", "a", "b"))
-    write_plans(plans, tmp_path / "plans.csv", layout="step")
-    again = read_plans(tmp_path / "plans.csv")
-    assert again.actions.tolist() == plans.actions.tolist()
-    assert again.group is again.plan_names is None
-
-
-STEPS = torch.tensor([[0, 1, 1], [2, 0, 0], [1, 2, 0]])
-WRITTEN = {
-    "numbers": {},
-    "names": {"action_names": ("eat", "rest", "walk"), "plan_names": ("b", "a", "c")},
-    "context": {"context": torch.tensor([[0, 1, 0], [1, 1, 0], [0, 0, 0]]), "context_names": ("day", "night")},
-    "features": {"context": torch.tensor([[[0.5, 1], [2, 3], [4, 5]]]).repeat(3, 1, 1)},
-    "groups": {"group": torch.tensor([0, 1, 1]), "group_names": ("m1", "m2"), "condition": torch.tensor([1, 0, 0])},
-    "durations": {"durations": torch.tensor([[1.5, torch.nan, 2], [1, 0, 0], [0, 3, 0]])},
-    "parts of a plan": {"group": torch.tensor([0, 0, 1]), "plan_names": ("s1", "s1", "s1")},
-}
-
-
-@pytest.mark.parametrize("fields", WRITTEN.values(), ids=WRITTEN)
-def test_a_frame_and_back(fields):
-    plans = Plans(STEPS, 3, torch.tensor([3, 1, 2]), **fields)
-    frame = plans.to_dataframe()
-    assert list(frame["action"].dropna().map(str)) == [name for row in listed(plans) for name in map(str, row)]
-    back = Plans.from_dataframe(frame, num_actions=3, action_names=fields.get("action_names"))
-    for name in ("actions", "lengths", "context", "group", "condition", "durations"):
-        want, got = getattr(plans, name), getattr(back, name)
-        if want is None:
-            assert got is None
-        else:
-            want = want.masked_fill(~plans.mask().view(3, 3, *[1] * (want.dim() - 2)), 0) if want.dim() > 1 else want
-            assert torch.equal(got.double().nan_to_num(-1), want.double().nan_to_num(-1)), name
-    for name in ("action_names", "plan_names", "group_names", "context_names"):
-        if name in fields:
-            assert tuple(getattr(back, name)) == tuple(fields[name])
-
-
-@pytest.mark.parametrize(
-    ("plans", "words"),
-    [
-        (Plans(STEPS, 3).with_end(), "without_end"),
-        (Plans(STEPS, 3, context=torch.zeros(3, 3, 2, dtype=torch.int32)), "patterns"),
-        (Plans(STEPS, 3, torch.tensor([3, 0, 2])), "plan 1 has no actions"),
-        (Plans(STEPS, 3, action_names=("a", "-", "b")), "'-'"),
-    ],
-)
-def test_what_a_frame_cannot_hold(plans, words):
-    with refuses(words):
-        plans.to_dataframe()
-
-
 @pytest.mark.parametrize("ends", ["stop", "duration"])
 def test_actions_that_follow_one_another_at_once_do_so_whatever_is_rounded(ends):
     """In floating point .011 + (.051 - .011) is less than .051, and .1 + .2 more than .3."""
@@ -543,15 +469,85 @@ def test_actions_that_follow_one_another_at_once_do_so_whatever_is_rounded(ends)
     rows = pd.DataFrame({"plan": np.repeat(np.arange(300), 5), "action": np.tile(list("abcde"), 300)})
     rows["start"] = times[:, :-1].ravel()
     rows[ends] = times[:, 1:].ravel() if ends == "stop" else (steps[:, 1:] / 1000).ravel()
-    plans = Plans.from_dataframe(rows, max_gap=0)
+    plans = plans_of_frame(rows, max_gap=0)
     assert (len(plans), plans.notes) == (300, ())
     for column in {"start", "stop"} & set(rows.columns):
         rows[column] += 0.0005 * (rows["action"] == "e")
-    assert len(Plans.from_dataframe(rows, max_gap=0)) == 600
+    assert len(plans_of_frame(rows, max_gap=0)) == 600
 
 
 def test_a_pause_of_just_max_gap_is_none_whatever_is_rounded():
     """1,035.9 - 35.9 is more than 1,000 in floating point."""
     frame = pd.DataFrame({"plan": 1, "action": ["a", "b"], "start": [0.0, 1035.9], "stop": [35.9, 1036.9]})
-    assert len(Plans.from_dataframe(frame, max_gap=1000)) == 1
-    assert len(Plans.from_dataframe(frame, max_gap=999.999)) == 2
+    assert len(plans_of_frame(frame, max_gap=1000)) == 1
+    assert len(plans_of_frame(frame, max_gap=999.999)) == 2
+
+
+def times(start):
+    return "plan,action,context_1,context_2\n" + "".join(f"p{i // 5},{i % 3},0.1,{start + 60 * i}\n" for i in range(10))
+
+
+def test_features_that_single_precision_does_not_hold(tmp_path):
+    """Minutes as seconds since 1970, where float32 counts in steps of 128; not a constant that it rounds."""
+    (tmp_path / "a.csv").write_text(times(1.7e9))
+    with refuses("context", "feature 2 of 2", "1.7e+09", "subtract a constant"):
+        read_events(tmp_path / "a.csv")
+    (tmp_path / "a.csv").write_text(times(0))
+    assert read_events(tmp_path / "a.csv").context.shape == (2, 5, 2)
+
+
+def test_features_that_are_constant_within_plans_have_no_note(tmp_path):
+    """A dose of each session, over many frames."""
+    lines = "".join(f"p{i // 30_000},{i % 2},{(0.1, 0.2)[i // 30_000]},{i % 7}.5\n" for i in range(60_000))
+    (tmp_path / "a.csv").write_text("plan,action,context_1,context_2\n" + lines)
+    assert not [note for note in read_events(tmp_path / "a.csv").notes if "within plans" in note]
+
+
+def test_features_that_hardly_vary_within_plans_are_noted(tmp_path):
+    """Sessions far apart, each of some seconds: what is left is a clock of sessions."""
+    for begin in (1.7e9, 0):
+        lines = [f"p{i // 5},{i % 3},0.5,{begin + 1000 * (i // 5) + i}\n" for i in range(60)]
+        (tmp_path / "a.csv").write_text("plan,action,context_1,context_2\n" + "".join(lines))
+        noted = [note for note in read_events(tmp_path / "a.csv").notes if "within plans" in note]
+        assert [note.split(",")[0] for note in noted] == ["feature 2 of the context is about 1.7e+09"] * bool(begin)
+
+
+@pytest.mark.parametrize("gap", ["", " ", "NA"])
+def test_a_plan_in_a_row_ends_where_a_label_is_missing(gap, tmp_path):
+    """And goes on as another behind it: what is before and after was not one after the other."""
+    rows = ["plan,group,action_1,action_2,action_3,action_4", f"x,a,0,{gap},1,2", f"y,b,{gap},1,2,", "z,b,2,0,,"]
+    (tmp_path / "plans.csv").write_text("\n".join(rows) + "\n")
+    plans = read_events(tmp_path / "plans.csv")
+    parts = [row[:length] for row, length in zip(plans.actions.tolist(), plans.lengths.tolist(), strict=True)]
+    assert parts == [[0], [1, 2], [1, 2], [2, 0]]
+    assert plans.recording == ("x", "x", "y", "z")
+    assert plans.group.tolist() == [0, 0, 1, 1]
+    assert "2 rows have no label" in plans.notes
+
+
+def test_recordings_are_named_as_in_the_file(tmp_path):
+    """Where a row without a label ends a plan, its parts have one name; numbers from 0 are no names."""
+    rows = ["s,b", "m1-day2,walk", "m1-day2,", "m1-day2,rest", "m1-day3,walk"]
+    plans = read(tmp_path, "\n".join(rows) + "\n", columns={"action": "b", "plan": "s"})
+    assert plans.recording == ("m1-day2", "m1-day2", "m1-day3")
+    plans = read(tmp_path, "plan,action_1,action_2,action_3\nx,0,?,1\ny,1,1,\n")
+    assert plans.recording == ("x", "x", "y")
+    assert read(tmp_path, "plan,action\n0,1\n1,0\n").recording is None
+
+
+def test_the_beginnings_of_actions_are_those_of_the_file(tmp_path):
+    """Of actions that are merged, the first of them; the parts of a plan go on in its time."""
+    text = "plan,action,start\n1,a,0.5\n1,a,2\n1,,3\n1,b,1e9\n2,b,7\n"
+    assert read(tmp_path, text).began.tolist() == [[0.5, 2], [1e9, 0], [7, 0]]
+    assert read(tmp_path, text, merge_repeats=True).began.tolist() == [[0.5], [1e9], [7]]
+    assert read(tmp_path, "plan,action\n1,a\n").began is None
+
+
+@pytest.mark.parametrize("text", ["action_1,action_2,action_3\n1,2,3\n3,1,\n", "plan,action\n1,1\n1,2\n1,3\n2,3\n"])
+def test_codes_from_1_are_noted(text, tmp_path):
+    """Action 0 never occurs: that there is one more action than the user thinks is said, unless the user said it."""
+    (note,) = read(tmp_path, text).notes
+    assert note == "actions are numbers from 0 to 3, of which 0 never occurs"
+    assert read(tmp_path, text).num_actions == 4
+    assert not read(tmp_path, text, num_actions=4).notes
+    assert not read(tmp_path, text, action_names=list("abcd")).notes

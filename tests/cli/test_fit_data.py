@@ -1,12 +1,15 @@
 """How `fit` reads plans, and divides them."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from neuroprior import ExhaustivePlanner, MarkovPrior, Plans, gridworld
+from neuroprior.behaviour import PastDurations, RecordedPlans
+from neuroprior.behaviour.report import ReadOptions
 from neuroprior.cli import fit as command
 from neuroprior.cli.fit_data import divide
-from neuroprior.plans import PastDurations
 from tests.support.sources import refuses, seeded
 
 
@@ -35,7 +38,12 @@ def test_how_a_file_is_read_is_passed_on(monkeypatch, fitted):
     options = {"num_actions": 3, "action_names": ["a", "b", "c"], "columns": object(), "missing": "label"}
     options |= {"merge_repeats": True, "max_gap": 3.5}
     asked = []
-    monkeypatch.setattr(command, "read_plans", lambda *given, **more: asked.append((*given, more)) or drawn(40))
+
+    def read(options, file):
+        asked.append((file, vars(options)))
+        return RecordedPlans.of(drawn(40))
+
+    monkeypatch.setattr(ReadOptions, "read", read)
     fitted(plans="plans.csv", **options)
     assert asked == [("plans.csv", options)]
 
@@ -53,7 +61,7 @@ def test_collected_plans_have_the_context_that_was_asked_for(context, shape, fit
 def test_contexts_may_be_left_out_and_ends_are_added_once(use_context, end, monkeypatch, fitted):
     plans = drawn(40, context=torch.arange(40) % 2)
     for read in (plans, plans.with_end() if end else plans):
-        monkeypatch.setattr(command, "read_plans", lambda *_, read=read, **__: read)
+        monkeypatch.setattr(command, "read_npz", lambda *_, read=read: RecordedPlans.of(read))
         monkeypatch.setattr(command, "write_plans", lambda *_: None)
         prior, parts = fitted(plans="plans.csv", use_context=use_context, end=end, resume="none")
         assert prior.takes_context == use_context
@@ -106,7 +114,7 @@ def test_of_two_unequal_groups_a_share_of_the_actions_is_for_validation():
 
 def test_durations_are_standardised_by_what_is_learned_from():
     """All parts get as many features; their scale is that of the plans to learn from, not of all."""
-    plans = drawn(40, durations=torch.rand(40, 5, generator=seeded(1)).add(0.1) ** 3)
+    plans = replace(RecordedPlans.of(drawn(40)), durations=torch.rand(40, 5, generator=seeded(1)).add(0.1) ** 3)
     plain, parts = divide(plans), divide(plans, past_durations=2)
     past = PastDurations.of(plain.learned_from, 2)
     assert parts.past_durations == past != PastDurations.of(plans, 2)

@@ -6,6 +6,8 @@ import torch
 from neuroprior import MarkovPrior, Plans, save
 from neuroprior.__main__ import main
 from neuroprior.behaviour import SemiMarkovPrior
+from neuroprior.behaviour.recorded_plans import RecordedPlans
+from neuroprior.behaviour.report import ReadOptions
 from neuroprior.plans import read_plans
 from tests.support.sources import seeded
 
@@ -31,13 +33,16 @@ def test_samples_are_those_of_the_library(tmp_path, capsys):
 def test_samples_with_durations_are_those_of_the_library(tmp_path):
     actions = torch.randint(3, (40, 6), generator=seeded(0))
     times = torch.rand(40, 6, generator=seeded(1)) + 0.5
-    prior = SemiMarkovPrior(3).fit(Plans(actions, 3, action_names=("a", "b", "c"), durations=times))
+    prior = SemiMarkovPrior(3).fit(RecordedPlans(actions, 3, action_names=("a", "b", "c"), durations=times))
     save(prior, tmp_path / "prior")
     assert main(["sample", str(tmp_path / "prior"), *OPTIONS, "--out", str(tmp_path / "new.npz")]) == 0
-    plans, due = read_plans(tmp_path / "new.npz"), prior.sample_plans(50, 4, temperature=3.0, generator=seeded(7))
+    plans = ReadOptions().read(str(tmp_path / "new.npz"))
+    due = prior.sample_plans(50, 4, temperature=3.0, generator=seeded(7))
     assert plans.actions.equal(due.actions)
     assert plans.durations.equal(due.durations)
     assert plans.action_names == ("a", "b", "c")
+    assert main(["sample", str(tmp_path / "prior"), *OPTIONS, "--out", str(tmp_path / "new.csv")]) == 0
+    assert read_plans(tmp_path / "new.csv", action_names=("a", "b", "c")).actions.equal(due.actions)
 
 
 @pytest.mark.parametrize(("given", "index"), [("wet", 1), ("dry", 0)])

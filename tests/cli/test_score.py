@@ -11,9 +11,12 @@ import torch
 
 from neuroprior import MarkovPrior, Plans, save
 from neuroprior.__main__ import main
+from neuroprior.behaviour.recorded_plans import RecordedPlans
+from neuroprior.behaviour.report import ReadOptions
 from neuroprior.behaviour.report.plan_report import report
+from neuroprior.behaviour.tables import read_events
 from neuroprior.cli import score as command
-from neuroprior.plans import read_plans, write_plans
+from neuroprior.plans import write_plans
 from neuroprior.priors.scoring import keep_learned
 from tests.support.sources import refuses, seeded
 
@@ -66,7 +69,7 @@ def test_tables_of_an_earlier_file_go_and_those_of_others_stay(tmp_path):
 
 
 def drawn(num, **more):
-    return Plans(torch.randint(3, (num, 5), generator=seeded(0)), 3, **more)
+    return RecordedPlans(torch.randint(3, (num, 5), generator=seeded(0)), 3, **more)
 
 
 def test_groups_and_conditions_have_tables_of_their_own(tmp_path, capsys):
@@ -118,11 +121,12 @@ def test_how_a_file_is_read_is_passed_on(file, given, names, tmp_path, monkeypat
     """The prior's names go with tables alone, unless others are given; notes are printed."""
     plans, asked = replace(drawn(8, action_names=("a", "b", "c")), notes=("something was odd",)), []
     save(MarkovPrior(3, 1).fit(plans), tmp_path / "prior")
-    monkeypatch.setattr(command, "read_plans", lambda *read, **more: asked.append((read, more)) or plans)
+    monkeypatch.setattr(ReadOptions, "read", lambda how, file: asked.append((file, vars(how))) or plans)
     options = {"missing": "label", "merge_repeats": True, "max_gap": 3.5, "columns": object(), "num_actions": 3}
     command.score(str(tmp_path / "prior"), file, action_names=given, out=str(tmp_path / "out"), **options)
-    assert asked[0] == ((file,), {**options, "action_names": names})
-    assert all(again == ((file,), options) for again in asked[1:])  # to see whether a table holds numbers
+    assert asked[0] == (file, {**options, "action_names": names})
+    plain = {**options, "action_names": None}
+    assert all(again == (file, plain) for again in asked[1:])  # to see whether a table holds numbers
     assert "note: something was odd" in capsys.readouterr().out
 
 
@@ -188,7 +192,7 @@ TAKEN = "contexts are numbers, which are taken for those of the prior's names: 0
     ],
 )
 def test_contexts_are_matched_by_name_or_it_is_said_how_they_are_numbered(learned, names, file, said, tmp_path, capsys):
-    plans = read_plans(of_contexts(tmp_path / "learned.csv", learned))
+    plans = read_events(of_contexts(tmp_path / "learned.csv", learned))
     if learned == (1, 2):  # numbers in a table, which another file names
         plans = replace(plans, context=(plans.context - 1).clamp(min=0), context_names=names)
     prior = MarkovPrior(2, 0, num_contexts=2).fit(plans)

@@ -45,7 +45,7 @@ def test_report_fit_and_score_read_it_alike(table, capsys):
     assert len(pd.read_csv("score/groups.csv")) == 8
     plans = pd.read_csv("score/plans.csv")
     assert len(plans) == 32
-    assert plans["plan"].tolist() == [1, 1, 2, 2] * 8  # the sessions as the file names them, in two parts each
+    assert plans["recording"].tolist() == [1, 1, 2, 2] * 8  # the sessions as the file names them, in two parts each
     said = " ".join(capsys.readouterr().out.split())
     assert f"Training data: {plans['training_data'].sum()} of 32 plans" in said
     assert plans["training_data"].sum() >= 24  # all but the held-out ones, and those of these that are the same

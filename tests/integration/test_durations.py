@@ -9,8 +9,10 @@ import pytest
 import torch
 
 from neuroprior.__main__ import main
-from neuroprior.behaviour import SemiMarkovPrior
-from neuroprior.plans import Plans, read_plans, write_plans
+from neuroprior.behaviour import PastDurations, SemiMarkovPrior
+from neuroprior.behaviour.recorded_plans import RecordedPlans
+from neuroprior.behaviour.report import ReadOptions
+from neuroprior.plans import write_plans
 from neuroprior.priors import GRUPrior, MarkovPrior, load, match_plans
 from tests.support.sources import seeded
 
@@ -25,8 +27,8 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> str:
     durations = torch.empty(60, 20).exponential_(generator=seeded(0))
     actions = torch.randint(3, (60, 20), generator=seeded(1))
     actions[:, 1:] = torch.where(durations[:, :-1] > 0.7, 0, actions[:, 1:])
-    place = tmp_path_factory.mktemp("plans") / "plans.jsonl"
-    write_plans(Plans(actions, 3, durations=durations, action_names=("a", "b", "c")), place)
+    place = tmp_path_factory.mktemp("plans") / "plans.npz"
+    write_plans(RecordedPlans(actions, 3, durations=durations, action_names=("a", "b", "c")), place)
     return str(place)
 
 
@@ -40,12 +42,13 @@ def test_the_recipe_and_its_samples(file: str, tmp_path: Path, capsys: pytest.Ca
     capsys.readouterr()
     for suffix in ("jsonl", "csv", "npz"):
         assert main(["sample", out, "--num-plans", "30", "--length", "9", "--out", f"{out}.{suffix}"]) == 0
-        sampled = read_plans(f"{out}.{suffix}")
-        assert bool((sampled.durations[sampled.mask()] > 0).all())
+        assert len(ReadOptions().read(f"{out}.{suffix}")) == 30
+    sampled = ReadOptions().read(f"{out}.npz")
+    assert bool((sampled.durations[sampled.mask()] > 0).all())
     capsys.readouterr()
     assert main(["sample", out, "--num-plans", "30", "--length", "9"]) == 0
     rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()[1:]]
-    assert all(len(row["actions"]) == len(row["durations"]) for row in rows)
+    assert [len(row["actions"]) for row in rows] == sampled.mask().sum(1).tolist()
 
 
 def test_a_network_as_its_action_prior(file: str, tmp_path: Path):
@@ -64,8 +67,8 @@ def test_a_network_that_knows_the_last_durations(file: str, tmp_path: Path):
     assert isinstance(prior, GRUPrior)
     rows = json.loads((tmp_path / "run" / "metrics.json").read_text())["rows"]
     assert rows[-1]["bits_per_action"] < min(row["bits_per_action"] for row in rows[:-1]) - 0.1
-    plans = read_plans(file)
-    nats = -prior.log_prob(match_plans(plans, prior)).detach().sum().item()
+    plans, past = ReadOptions().read(file), PastDurations.load(tmp_path / "run")
+    nats = -prior.log_prob(past.added_to(match_plans(plans, prior))).detach().sum().item()
     expected = nats / math.log(2) / plans.actions.numel()
     assert main(["score", out, file, "--out", str(tmp_path / "score")]) == 0
     scored = pd.read_csv(tmp_path / "score" / "plans.csv")
@@ -75,7 +78,7 @@ def test_a_network_that_knows_the_last_durations(file: str, tmp_path: Path):
     assert row["bits_per_action"] == pytest.approx(expected, abs=1e-4)
     assert row["context"] == "actions and durations"
     assert main(["fit", "--resume", out]) == 0
-    assert load(out).past_durations == prior.past_durations
+    assert PastDurations.load(tmp_path / "run") == past
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import torch
 
 from neuroprior import Plans, load, write_plans
 from neuroprior.__main__ import main
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.report import FitOptions, report
 from neuroprior.priors import SwitchingPrior
 from tests.support.sources import seeded
@@ -95,7 +96,7 @@ def test_the_report_compares_conditions_by_modes():
     wild = torch.rand(36, 80, generator=seeded(1)) < 0.2
     actions = torch.where(wild, torch.randint(3, (36, 80), generator=seeded(2)), mode)
     group = torch.arange(36) % 12
-    plans = Plans(actions, 3, group=group, condition=often[:, 0], condition_names=("control", "treated"))
+    plans = RecordedPlans(actions, 3, group=group, condition=often[:, 0], condition_names=("control", "treated"))
     made = of_modes(plans, 2)
     tests = made.frames["mode_condition_tests"].set_index("test")
     assert tests.loc["actions", "p_value"] < 0.05

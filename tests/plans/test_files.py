@@ -1,8 +1,6 @@
 """Files of plans: what is written comes back, and what others write is read as they mean it."""
 
 import json
-import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import Plans
+from neuroprior.behaviour.report import ReadOptions
 from neuroprior.plans import expand_context, read_plans, write_plans
 from neuroprior.plans.columns import is_missing, number_in
 
@@ -26,9 +25,9 @@ def in_csv(name):
 
 
 @st.composite
-def plans_of_all_kinds(draw, shortest=0, names=NAMES):
+def plans_of_all_kinds(draw, names=NAMES, contexts=CONTEXTS):
     """Plans of which one at least has an action, with any kind of context, names, groups and `end`."""
-    lengths = draw(st.lists(st.integers(shortest, 5), min_size=1, max_size=6))
+    lengths = draw(st.lists(st.integers(0, 5), min_size=1, max_size=6))
     lengths[0] = max(lengths[0], 1)
     num, longest, num_actions = len(lengths), max(lengths), draw(st.sampled_from([1, 3, 300]))
 
@@ -41,7 +40,7 @@ def plans_of_all_kinds(draw, shortest=0, names=NAMES):
     def some_names(count):
         return tuple(draw(st.lists(names, min_size=count, max_size=count, unique=True)))
 
-    actions, kind = numbers(num_actions, num, longest), draw(st.sampled_from(CONTEXTS))
+    actions, kind = numbers(num_actions, num, longest), draw(st.sampled_from(contexts))
     there = torch.arange(longest) < torch.tensor(lengths)[:, None]
     context = None
     if kind.startswith("features"):
@@ -52,13 +51,6 @@ def plans_of_all_kinds(draw, shortest=0, names=NAMES):
     elif kind != "none":
         context = numbers(4, num, longest) * there if kind.endswith("step") else numbers(4, num)
     group_names = some_names(3) if draw(st.booleans()) else None
-    condition_names = some_names(2) if draw(st.booleans()) else None
-    durations = None
-    if draw(st.booleans()):
-        size = num * longest
-        some = st.floats(0, 2.0**100, width=32) | st.just(math.nan)
-        durations = torch.tensor(draw(st.lists(some, min_size=size, max_size=size))).reshape(num, longest)
-    plan_names = [f"plan {n}" for n in range(1, num + 1)] if draw(st.booleans()) else None
     return Plans(
         actions,
         num_actions,
@@ -68,10 +60,6 @@ def plans_of_all_kinds(draw, shortest=0, names=NAMES):
         numbers(3, num) if group_names or draw(st.booleans()) else None,
         some_names(4) if kind.startswith("name") else None,
         group_names,
-        durations=durations,
-        condition=numbers(2, num) if condition_names or draw(st.booleans()) else None,
-        condition_names=condition_names,
-        plan_names=plan_names,
     )
 
 
@@ -82,17 +70,14 @@ def called(numbers, names):
 def assert_same(one, other, numbering=True):
     """The same plans; with `numbering` False, contexts and groups need have the same names only, not numbers."""
     assert (one.num_actions, one.end) == (other.num_actions, other.end)
-    assert (one.durations is None) == (other.durations is None)
-    if one.durations is not None:
-        assert torch.equal(one.durations.nan_to_num(-1), other.durations.nan_to_num(-1))
-    for key in ("actions", "lengths", "context", "group", "condition"):
+    for key in ("actions", "lengths", "context", "group"):
         a, b = getattr(one, key), getattr(other, key)
         assert (a is None) == (b is None), key
         names = f"{key}_names"
         if a is None:
             continue
         assert a.shape == b.shape
-        if numbering or (key not in ("group", "condition") and not getattr(one, names, None)):
+        if numbering or (key != "group" and not getattr(one, names, None)):
             assert a.dtype == b.dtype
             assert torch.equal(a, b), key
         elif a.dim() == 2:  # names of contexts; what stands beyond a plan's end does not count
@@ -102,9 +87,8 @@ def assert_same(one, other, numbering=True):
         else:
             assert list(map(str, called(a, getattr(one, names)))) == list(map(str, called(b, getattr(other, names))))
     assert one.action_names == other.action_names
-    assert one.plan_names == other.plan_names
     if numbering:
-        for what in ("context", "group", "condition"):
+        for what in ("context", "group"):
             assert getattr(one, f"{what}_names") == getattr(other, f"{what}_names")
 
 
@@ -118,12 +102,12 @@ def test_npz_and_jsonl_hold_everything(tmp_path_factory, suffix, plans, closed):
     assert_same(read_plans(path), plans)
 
 
-@pytest.mark.parametrize(("suffix", "layout"), [(".csv", None), (".csv", "step"), (".tsv", None)])
+@pytest.mark.parametrize("suffix", [".csv", ".tsv"])
 @settings(derandomize=True, deadline=None, max_examples=60)
-@given(plans=plans_of_all_kinds(shortest=1, names=NAMES.filter(in_csv)))
-def test_csv_holds_actions_contexts_and_groups(tmp_path_factory, suffix, layout, plans):
+@given(plans=plans_of_all_kinds(names=NAMES.filter(in_csv), contexts=("none", "index", "name", "features")))
+def test_csv_holds_actions_contexts_and_groups(tmp_path_factory, suffix, plans):
     path = tmp_path_factory.mktemp("files") / f"plans{suffix}"
-    write_plans(plans, path, layout=layout)
+    write_plans(plans, path)
     back = read_plans(path, num_actions=plans.num_actions, action_names=plans.action_names)
     assert_same(back, plans, numbering=False)
 
@@ -135,28 +119,21 @@ def test_csv_holds_plans_without_actions_beside_others(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("context", "layout", "columns"),
+    ("context", "columns"),
     [
-        (torch.tensor([3, 1]), None, ["action_1", "action_2", "context"]),
-        (torch.tensor([[3, 1], [0, 0]]), None, ["plan", "action", "context"]),
-        (torch.tensor([[0.5, 1], [2, 3]]), None, ["action_1", "action_2", "context_1", "context_2"]),
-        (torch.eye(2)[..., None], None, ["plan", "action", "context_1"]),
-        (None, None, ["action_1", "action_2"]),
-        (None, "step", ["plan", "action"]),
+        (torch.tensor([3, 1]), ["action_1", "action_2", "context"]),
+        (torch.tensor([[3, 3], [1, 1]]), ["action_1", "action_2", "context"]),
+        (torch.tensor([[0.5, 1], [2, 3]]), ["action_1", "action_2", "context_1", "context_2"]),
+        (None, ["action_1", "action_2"]),
     ],
 )
-def test_the_layout_of_csv_follows_the_context(tmp_path, context, layout, columns):
+def test_the_columns_of_csv(tmp_path, context, columns):
     path = tmp_path / "a.csv"
-    write_plans(Plans(torch.tensor([[0, 1], [1, 1]]), 2, context=context), path, layout=layout)
+    write_plans(Plans(torch.tensor([[0, 1], [1, 1]]), 2, context=context), path)
     assert path.read_text().splitlines()[0].split(",") == columns
     back = read_plans(path)
     assert back.actions.tolist() == [[0, 1], [1, 1]]
     assert context is None or torch.equal(back.context, expand_context(context, 2))
-
-
-def test_a_context_per_plan_is_repeated_on_its_steps(tmp_path):
-    write_plans(Plans(torch.tensor([[0, 1]]), 2, context=torch.tensor([7])), tmp_path / "a.csv", layout="step")
-    assert read_plans(tmp_path / "a.csv").context.tolist() == [[7, 7]]
 
 
 def read_text(tmp_path, name, text, **options):
@@ -217,8 +194,7 @@ def test_a_decimal_point_may_come_in_a_later_plan(tmp_path):
         "Action_2,note,action_1,action_3\n1,x,0,2\n,y,1,\n",
         "0.0,1.0,2.0\n1.0,,\n",
         "0.000000e+00,1.000000e+00,2.000000e+00\n1e0, ,\n",
-        "plan,action\n7,0\n7,1\n7,2\n8,1\n",
-        '\ufeffnote;plan;action\n"a;b\n c";x;0\n;x;1\n;x;2\n;y;1',
+        '\ufeffnote;action_1;action_2;action_3\n"a;b\n c";0;1;2\n;1;;',
     ],
 )
 def test_csv_by_hand(tmp_path, text):
@@ -234,16 +210,15 @@ def test_csv_of_numpy(tmp_path):
         assert read_plans(tmp_path / "a.csv").actions.tolist() == actions.tolist()
 
 
-def test_csv_of_a_coded_video(tmp_path):
+def test_csv_with_names(tmp_path):
     plans = read_text(
         tmp_path,
         "a.tsv",
-        "Plan\tTime\tAction\tContext\tGroup\n1\t0.5\trear\tlight\t12\n"
-        "1\t1.5\tgroom up\tdark\t12\n2\t9\trear\tdark\t12b\n",
+        "Action_1\tNote\tAction_2\tContext\tGroup\nrear\t0.5\tgroom up\tlight\t12\nrear\t9\t\tdark\t12b\n",
         action_names=["rear", "walk", "groom up"],
     )
-    assert (plans.actions.tolist(), plans.num_actions) == ([[0, 2], [0, 0]], 3)
-    assert (plans.context.tolist(), plans.context_names) == ([[1, 0], [0, 0]], ("dark", "light"))
+    assert (plans.actions.tolist(), plans.lengths.tolist(), plans.num_actions) == ([[0, 2], [0, 0]], [2, 1], 3)
+    assert (plans.context.tolist(), plans.context_names) == ([[1, 1], [0, 0]], ("dark", "light"))
     assert (plans.group.tolist(), plans.group_names) == ([0, 1], ("12", "12b"))
 
 
@@ -303,79 +278,11 @@ def test_an_old_file_is_replaced_or_stays(tmp_path):
 def test_what_belongs_to_plans_stays_with_them_in_long_files(name, tmp_path):
     """Files are written in blocks of 16,384 plans."""
     number = torch.arange(2**14 + 3)
-    times = number[:, None] / 4
-    plans = Plans(
-        number[:, None] % 3, 3, context=number[:, None] % 7, group=number, durations=times, condition=number % 5
-    )
+    plans = Plans(number[:, None] % 3, 3, context=number[:, None] % 7, group=number)
     write_plans(plans, tmp_path / name)
     found = read_plans(tmp_path / name)
-    for what in ("actions", "context", "group", "durations", "condition"):
+    for what in ("actions", "context", "group"):
         assert torch.equal(getattr(found, what), getattr(plans, what)), what
-
-
-CODES = Plans(torch.tensor([[1, 2, 3], [3, 1, 0]]), 4, torch.tensor([3, 2]))
-
-
-@pytest.mark.parametrize("name", ["a.csv", "a.tsv", "a.jsonl", "a.npz", "steps.csv"])
-def test_codes_from_1_are_noted(name, tmp_path):
-    """Action 0 never occurs: that there is one more action than the user thinks is said, unless the user said it."""
-    path = tmp_path / name
-    if name == "a.npz":
-        np.savez(path, actions=CODES.actions.numpy(), lengths=CODES.lengths.numpy())
-    elif name == "a.jsonl":
-        path.write_text('{"actions": [1, 2, 3]}\n{"actions": [3, 1]}\n')
-    else:
-        write_plans(CODES, path, layout="step" if name == "steps.csv" else None)
-    (note,) = read_plans(path).notes
-    assert note == "actions are numbers from 0 to 3, of which 0 never occurs"
-    assert read_plans(path).num_actions == 4
-    assert not read_plans(path, num_actions=4).notes
-    assert not read_plans(path, action_names=list("abcd")).notes
-
-
-def parted() -> Plans:
-    """Three sessions of two mice; one of them in three parts."""
-    names, group = ["day 2", "day 2", "day 2", "day 1", "day 2"], torch.tensor([0, 0, 0, 0, 1])
-    own = {"group": group, "group_names": ["m1", "m2"], "condition": group, "durations": torch.ones(5, 3)}
-    return Plans(torch.arange(15).view(5, 3) % 4, 4, torch.tensor([2, 1, 3, 3, 1]), plan_names=names, **own)
-
-
-@pytest.mark.parametrize("name", ["a.npz", "a.jsonl", "a.csv"])
-def test_parts_of_a_plan_have_its_name(tmp_path, name):
-    """They are parts of one plan when they are read again, and not one plan."""
-    write_plans(parted(), tmp_path / name)
-    assert_same(read_plans(tmp_path / name, num_actions=4), parted(), numbering=False)
-
-
-def test_plans_of_one_name_are_parts_of_one_plan_in_one_group_alone(tmp_path):
-    """The first session of the second mouse follows the one of the first mouse, and is called as that is."""
-    group = torch.tensor([0, 0, 1, 1, 1])
-    own = {"group": group, "group_names": ["m1", "m2"], "plan_names": ["day 2", "day 1", "day 1", "day 1", "day 2"]}
-    some = Plans(torch.arange(15).view(5, 3) % 4, 4, durations=torch.ones(5, 3), **own)
-    write_plans(some, tmp_path / "a.csv", layout="step")
-    assert_same(read_plans(tmp_path / "a.csv", num_actions=4), some, numbering=False)
-
-
-def test_in_csv_parts_that_are_not_together_are_numbered(tmp_path):
-    some = parted()[torch.tensor([0, 3, 1])]
-    assert some.plan_names == ("day 2", "day 1", "day 2")
-    write_plans(some, tmp_path / "a.csv")
-    assert_same(read_plans(tmp_path / "a.csv", num_actions=4), replace(some, plan_names=None), numbering=False)
-
-
-def test_plans_are_named_as_in_the_file(tmp_path):
-    """Where a row without a label ends a plan, its parts have one name; numbers from 0 are no names."""
-    rows = ["s,b", "m1-day2,walk", "m1-day2,", "m1-day2,rest", "m1-day3,walk"]
-    (tmp_path / "a.csv").write_text("\n".join(rows) + "\n")
-    plans = read_plans(tmp_path / "a.csv", columns={"action": "b", "plan": "s"})
-    assert plans.plan_names == ("m1-day2", "m1-day2", "m1-day3")
-    (tmp_path / "b.csv").write_text("plan,action_1,action_2,action_3\nx,0,?,1\ny,1,1,\n")
-    assert read_plans(tmp_path / "b.csv").plan_names == ("x", "x", "y")
-    (tmp_path / "c.csv").write_text("plan,action\n0,1\n1,0\n")
-    assert read_plans(tmp_path / "c.csv").plan_names is None
-    (tmp_path / "d.jsonl").write_text('{"actions": [0], "plan": "x"}\n{"actions": [1]}\n')
-    with pytest.raises(ValueError, match="line 2: `plan` must be a name in every plan, or in none"):
-        read_plans(tmp_path / "d.jsonl")
 
 
 @pytest.mark.parametrize(("suffix", "delimiter"), [(".csv", ","), (".csv", ";"), (".tsv", "\t")])
@@ -389,49 +296,38 @@ def test_a_row_may_be_longer_than_a_cell_can_be(suffix, delimiter, header, tmp_p
     assert read_plans(tmp_path / f"plans{suffix}").actions.equal(actions)
 
 
-@pytest.mark.parametrize("gap", ["", " ", "NA"])
-def test_a_plan_in_a_row_ends_where_a_label_is_missing(gap, tmp_path):
-    """And goes on as another behind it: what is before and after was not one after the other."""
-    rows = ["plan,group,action_1,action_2,action_3,action_4", f"x,a,0,{gap},1,2", f"y,b,{gap},1,2,", "z,b,2,0,,"]
-    (tmp_path / "plans.csv").write_text("\n".join(rows) + "\n")
-    plans = read_plans(tmp_path / "plans.csv")
-    parts = [row[:length] for row, length in zip(plans.actions.tolist(), plans.lengths.tolist(), strict=True)]
-    assert parts == [[0], [1, 2], [1, 2], [2, 0]]
-    assert plans.plan_names == ("x", "x", "y", "z")
-    assert plans.group.tolist() == [0, 0, 1, 1]
-    assert "2 rows have no label" in plans.notes
-
-
 @pytest.mark.parametrize("name", ["A.CSV", "a.Tsv", "a.JSONL", "a.NPZ"])
 def test_suffixes_may_be_in_capitals(name, tmp_path):
-    some = parted() if name != "a.Tsv" else Plans(parted().actions, 4)
+    some = Plans(torch.arange(15).view(5, 3) % 4, 4, torch.tensor([2, 1, 3, 3, 1]), group=torch.arange(5))
     write_plans(some, tmp_path / name)
-    assert read_plans(tmp_path / name, num_actions=4).plan_names == some.plan_names
+    assert_same(read_plans(tmp_path / name, num_actions=4), some)
     write_plans(some, tmp_path / name.lower())
     assert (tmp_path / name).read_bytes() == (tmp_path / name.lower()).read_bytes()
 
 
-def test_what_is_not_read_is_noted(tmp_path):
+def test_what_is_not_read_is_said(tmp_path):
     """A misspelt key would make plans of one animal independent ones."""
     write = {
         "plans.jsonl": lambda file, key: file.write_text(
-            "".join(json.dumps({"actions": [0, 1], key: 3}) + "\n" for _ in range(2))
+            "".join(json.dumps({"plan": 1, "actions": [0, 1], key: 3}) + "\n" for _ in range(2))
         ),
         "plans.npz": lambda file, key: np.savez(file, actions=np.array([[0, 1], [0, 1]]), **{key: np.array([3, 3])}),
     }
     for name, save in write.items():
-        for key, notes in (("group", 0), ("grup", 1)):
-            save(tmp_path / name, key)
-            plans = read_plans(tmp_path / name)
-            assert (plans.group is None) == (key == "grup")
-            assert [note for note in plans.notes if "not used: grup" in note] == list(plans.notes)[:notes]
-            assert len(plans.notes) == notes
+        save(tmp_path / name, "group")
+        assert read_plans(tmp_path / name).group.tolist() == [3, 3]
+        save(tmp_path / name, "grup")
+        with pytest.warns(UserWarning, match=f"{name}: (keys|arrays) that are not used: grup$") as warned:
+            assert read_plans(tmp_path / name).group is None
+        assert [one.filename for one in warned] == [__file__]
+        (note,) = ReadOptions().read(str(tmp_path / name)).notes
+        assert note.endswith("that are not used: grup")
 
 
 def test_groups_in_an_npz_file_may_be_names(tmp_path):
     groups = np.array(["b", "a", "b"])
     np.savez(tmp_path / "plans.npz", actions=np.array([[0, 1]] * 3), group=groups, condition=groups)
-    plans = read_plans(tmp_path / "plans.npz")
+    plans = ReadOptions().read(str(tmp_path / "plans.npz"))
     for number, names in ((plans.group, plans.group_names), (plans.condition, plans.condition_names)):
         assert [names[i] for i in number.tolist()] == groups.tolist()
 
@@ -464,7 +360,7 @@ def test_as_many_features_of_a_plan_as_it_has_actions_are_noted(name, tmp_path):
 
     def read(context):
         write_plans(Plans(actions, 2, context=context), tmp_path / name)
-        found = read_plans(tmp_path / name, num_actions=2)
+        found = ReadOptions(num_actions=2).read(str(tmp_path / name))
         assert found.context.shape == expand_context(context, 3).shape
         return found.notes
 

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import Plans
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.plans.folds import BLOCKS, fair_split, folds, in_parts, pieces
 from tests.support.sources import refuses, seeded
 
@@ -65,7 +66,7 @@ def test_no_plans_have_no_folds():
         folds(Plans(torch.zeros(0, 2).long(), 2), 2)
 
 
-def in_steps(length: int, kind: str, pad: int = 0) -> Plans:
+def in_steps(length: int, kind: str, pad: int = 0) -> RecordedPlans:
     """A single plan whose context is the place of each action, with `pad` columns beyond its end."""
     actions = torch.arange(length + pad) % 5
     place = torch.arange(length + pad)
@@ -78,7 +79,7 @@ def in_steps(length: int, kind: str, pad: int = 0) -> Plans:
     }[kind]
     lengths = torch.tensor([length]) if pad else None
     more = {"durations": place[None] / 4, "condition": torch.tensor([1]), "condition_names": ("wild", "tame")}
-    return Plans(actions[None], 5, lengths, tuple("abcde"), context, torch.tensor([4]), **more)
+    return RecordedPlans(actions[None], 5, lengths, tuple("abcde"), context, torch.tensor([4]), **more)
 
 
 @pytest.mark.parametrize("kind", ["none", "index a plan", "features a plan", "index a step", "features a step"])
@@ -116,10 +117,10 @@ def test_pieces_of_several_plans_make_them_again(kind):
     context = None if one.context is None else one.context.repeat(4, *[1] * (one.context.dim() - 1))
     actions = torch.arange(40).view(4, 10) % 5
     names = ("a", "b", "c", "d")
-    plans = Plans(actions, 5, lengths, None, context, torch.tensor([0, 0, 1, 1]), plan_names=names)
+    plans = RecordedPlans(actions, 5, lengths, None, context, torch.tensor([0, 0, 1, 1]), recording=names)
     cut = pieces(plans, 4)
     assert cut.mask().sum(1).tolist() == [4, 4, 2, 0, 4, 3]
-    assert cut.plan_names == ("a", "a", "a", "b", "c", "d")
+    assert cut.recording == ("a", "a", "a", "b", "c", "d")
     assert cut.group is None
     assert cut.actions[cut.mask()].equal(plans.actions[plans.mask()])
     if kind != "none":

@@ -1,7 +1,5 @@
 """Plans: shapes, dtypes, lengths, contexts, splits, and what is refused."""
 
-import math
-
 import pytest
 import torch
 from hypothesis import given, settings
@@ -210,31 +208,18 @@ def test_names_must_name_every_number():
         Plans(ACTIONS, 3, context_names=("a",))
 
 
-@pytest.mark.parametrize("wrong", [-0.5, math.inf, -math.inf])
-def test_durations_are_times_where_there_are_actions(wrong):
-    """Those that are not known are NaN; whatever stands beyond the ends of plans is 0."""
-    durations, lengths = torch.tensor([[1.5, 0.0, wrong], [math.nan, 2.0, wrong]]), torch.tensor([2, 2])
-    actions = torch.zeros(2, 3, dtype=torch.long)
-    kept = Plans(actions, 1, lengths, durations=durations).durations
-    assert kept.nan_to_num(-1).tolist() == [[1.5, 0, 0], [-1, 2, 0]]
-    with refuses(f"`durations[1, 2]` must be finite times from 0, got {wrong}"):
-        Plans(actions, 1, torch.tensor([2, 3]), durations=durations)
-
-
 def test_steps_of_plans() -> None:
     plans = Plans(
         torch.tensor([[0, 1, 2, 3], [3, 2, 0, 0], [1, 0, 0, 0]]),
         4,
         torch.tensor([4, 2, 1]),
         context=torch.arange(12).view(3, 4),
-        durations=torch.arange(12.0).view(3, 4),
         group=torch.tensor([0, 0, 1]),
     )
     cut = plans.steps(1, 3)
     assert cut.lengths.tolist() == [2, 1, 0]
     assert cut.actions.tolist() == [[1, 2], [2, 0], [0, 0]]
     assert cut.context.tolist() == [[1, 2], [5, 0], [0, 0]]
-    assert cut.durations.tolist() == [[1, 2], [5, 0], [0, 0]]
     assert cut.group.tolist() == [0, 0, 1]
     assert plans.steps(7).max_length == 0
     assert plans.steps(7).lengths.tolist() == [0, 0, 0]
@@ -245,24 +230,6 @@ def test_steps_of_plans() -> None:
         plans.steps(-1)
     with pytest.raises(ValueError, match="`stop` must be at least 3"):
         plans.steps(3, 2)
-
-
-def test_plans_keep_their_names():
-    plans = Plans(torch.arange(6).view(3, 2), 6, plan_names=["a", "b", "a"])
-    assert plans.plan_names == ("a", "b", "a")
-    assert plans[1:].plan_names == ("b", "a")
-    assert plans[torch.tensor([2, 1])].plan_names == ("a", "b")
-    assert plans[torch.tensor([True, False, True])].plan_names == ("a", "a")
-    assert plans.with_end().plan_names == plans.steps(1).plan_names == plans.plan_names
-    for part in plans.split(0.4, torch.Generator().manual_seed(0)):
-        assert [("a", "b", "a")[int(first) // 2] for first in part.actions[:, 0]] == list(part.plan_names)
-    for wrong, words in (
-        (["a", "b"], "`plan_names` must be 3, one a plan, got 2"),
-        ("abc", "`plan_names` must be a list of texts"),
-        (["a", "b", "\ud83d"], ".*surrogate"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            Plans(plans.actions, 6, plan_names=wrong)
 
 
 def test_plans_that_need_not_move_are_themselves():

@@ -8,6 +8,7 @@ import torch
 
 from neuroprior import behaviour, priors
 from neuroprior.behaviour import SemiMarkovPrior
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.plans import Plans
 from neuroprior.priors import (
     CombinedPrior,
@@ -59,7 +60,7 @@ def plans_for(prior: Prior, num: int = 40) -> Plans:
         context = torch.randint(C, (num, 6), generator=seeded(1))
     elif prior.context_size is not None:
         context = torch.randn(num, 6, 2, generator=seeded(1))
-    return Plans(actions, A, context=context, durations=torch.rand(num, 6, generator=seeded(2)))
+    return RecordedPlans(actions, A, context=context, durations=torch.rand(num, 6, generator=seeded(2)))
 
 
 @pytest.mark.parametrize("name", ALL)

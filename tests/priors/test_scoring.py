@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from neuroprior import MarkovPrior, Plans, UniformPrior
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.priors import match_plans
 from neuroprior.priors.scoring import keep_learned, learned_from, score
 from tests.support.sources import refuses, seeded
@@ -13,7 +14,7 @@ from tests.support.sources import refuses, seeded
 NAMES = ("groom", "rear", "walk")
 TRAINING = Plans(torch.randint(3, (40, 8), generator=seeded(0)), 3, action_names=NAMES)
 PRIOR = MarkovPrior(3, 1).fit(TRAINING)
-NEW = Plans(
+NEW = RecordedPlans(
     torch.tensor([[0, 1, 1], [1, 0, 0], [0, 0, 1]]),
     2,
     torch.tensor([3, 2, 0]),
@@ -75,7 +76,11 @@ def test_other_numbers_are_never_taken_for_the_same():
 def test_bad_input():
     with refuses("by", "'animal'"):
         score(PRIOR, NEW, "animal")
+    with refuses("by", "no group"):
+        score(PRIOR, TRAINING, "group")
     with refuses("by", "no condition"):
+        score(PRIOR, RecordedPlans.of(TRAINING), "condition")
+    with refuses("`by` must be one of plan, action, group, got 'condition'"):
         score(PRIOR, TRAINING, "condition")
 
 

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from neuroprior import Plans
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from tests.support.sources import seeded
 
 
@@ -47,7 +48,9 @@ def study(
     for action, times in (slower or {}).items():
         logs += torch.tensor(times).log() * ((actions == action) & (condition == 1)[:, None])
     names = [f"drug {label}" for label in range(int(condition.max()) + 1)]
-    return Plans(actions, num_actions, group=animal, condition=condition, condition_names=names, durations=logs.exp())
+    return RecordedPlans(
+        actions, num_actions, group=animal, condition=condition, condition_names=names, durations=logs.exp()
+    )
 
 
 def between(animals: int, sessions: int = 4, num: int = 2) -> list[list[int]]:

@@ -23,7 +23,7 @@ from neuroprior import (
     from_gymnasium,
     gridworld,
 )
-from neuroprior.behaviour import SemiMarkovPrior
+from neuroprior.behaviour import RecordedPlans, SemiMarkovPrior
 from neuroprior.puzzles import LogLinearPrior, sliding_tiles, sokoban
 from neuroprior.testing import check_prior, check_world
 from neuroprior.testing.chi_square import alike, chi_square
@@ -60,7 +60,9 @@ PRIORS = {
     "markov-3, dirichlet, context a step": lambda: MarkovPrior(
         3, 3, num_contexts=4, backoff="dirichlet", initial="lower"
     ).fit(random_plans(3, index_context(60, 5))),
-    "semi-markov": lambda: SemiMarkovPrior(4).fit(replace(random_plans(4), durations=torch.ones(60, 5))),
+    "semi-markov": lambda: SemiMarkovPrior(4).fit(
+        replace(RecordedPlans.of(random_plans(4)), durations=torch.ones(60, 5))
+    ),
     "context tree untrained": lambda: ContextTreePrior(4),
     "context tree": lambda: ContextTreePrior(4, 3).fit(random_plans(4)),
     "context tree, one action": lambda: ContextTreePrior(1, 2).fit(random_plans(1)),

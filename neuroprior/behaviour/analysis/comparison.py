@@ -1,16 +1,17 @@
 """Priors compared on held-out plans: bits per action with intervals, and count-based baselines."""
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from math import inf, log, log2
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from neuroprior._statistics import ENOUGH_UNITS, ROUNDING, Difference, ratio_difference
 from neuroprior.plans import Plans
-from neuroprior.plans.columns import never_occur
+from neuroprior.plans.columns import SHOWN, Integers, listed, named
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
 from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors import ContextTreePrior, Prior, UniformPrior
@@ -132,6 +133,14 @@ def action_bits(prior: Prior, plans: Plans) -> Tensor:
     check_are_plans(plans)
     with torch.no_grad():
         return -prior.action_log_probs(plans_for(prior, plans)).double().cpu() / log(2)
+
+
+def never_occur(occur: Integers, num_actions: int, names: Sequence[str] | None = None) -> str:
+    """Which of the actions are none of those that `occur`, and that they never occur; "" where all do."""
+    number = num_actions - len(occur)
+    first = np.setdiff1d(np.arange(min(num_actions, len(occur) + SHOWN)), occur).tolist()  # at least `SHOWN`, or all
+    verb = "occurs" if number == 1 else "occur"
+    return f"{listed(named(first, names), number)} never {verb}" if number else ""
 
 
 def never_taken(plans: Plans) -> str:

@@ -17,7 +17,7 @@ from neuroprior._statistics import ENOUGH_UNITS, Difference, holm, ratio_differe
 from neuroprior.behaviour.analysis.condition_chains import SMOOTHING, ConditionChains
 from neuroprior.behaviour.analysis.flat import FlatPlans, ranks
 from neuroprior.behaviour.analysis.permutation_design import PermutationDesign
-from neuroprior.plans import Plans
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.plans.plans import check_are_plans
 
 LEVEL = 0.05
@@ -146,7 +146,7 @@ class ConditionComparison:
 
 
 def compare_conditions(
-    plans: Plans, permutations: int = 9_999, generator: torch.Generator | None = None
+    plans: RecordedPlans, permutations: int = 9_999, generator: torch.Generator | None = None
 ) -> ConditionComparison:
     """Whether behaviour differs between the conditions of plans.
 
@@ -173,12 +173,14 @@ def compare_conditions(
 
     Example:
         >>> first, second = torch.tensor([[0, 1] * 10]).repeat(8, 1), torch.tensor([[0, 0, 1, 1] * 5]).repeat(8, 1)
-        >>> plans = Plans(torch.cat([first, second]), 2, group=torch.arange(16), condition=torch.arange(16) // 8)
+        >>> condition = torch.arange(16) // 8
+        >>> plans = RecordedPlans(torch.cat([first, second]), 2, group=torch.arange(16), condition=condition)
         >>> found = compare_conditions(plans, permutations=199, generator=torch.Generator().manual_seed(0))
         >>> found.p_value < 0.05
         True
     """
     check_are_plans(plans)
+    plans = RecordedPlans.of(plans)
     check_sizes(permutations=permutations)
     design = PermutationDesign.of(plans)
     names = [
@@ -236,7 +238,9 @@ def _on_cpu(flat: FlatPlans) -> FlatPlans:
     return FlatPlans(flat.actions.cpu(), flat.plan.cpu(), flat.place.cpu(), flat.num_actions)
 
 
-def _counted(plans: Plans, flat: FlatPlans, block: Tensor, num: int) -> Iterator[tuple[str, Tensor, Tensor, Tensor]]:
+def _counted(
+    plans: RecordedPlans, flat: FlatPlans, block: Tensor, num: int
+) -> Iterator[tuple[str, Tensor, Tensor, Tensor]]:
     """Name, features `[F, n]`, and the two sums `[B, F]` whose ratio is the number of a block, of each family."""
     ones = torch.ones(len(block), dtype=torch.double)
     for name, length in (("actions", 1), ("transitions", 2), ("sequences", 3)):

@@ -1,6 +1,6 @@
 """How far back dependence reaches: the information of an action about later ones, by counts and by a prior."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import log
 
 import torch
@@ -211,15 +211,13 @@ def pieces(plans: Plans, length: int, most: int, generator: torch.Generator | No
     if context is not None:
         context = context[plan[:, None], step]
     grouped = plans.group is not None and unit_name(plans, start_here) == "groups"
-    return replace(
-        plans,
-        actions=plans.actions[plan[:, None], step],
-        lengths=None,
+    return Plans(
+        plans.actions[plan[:, None], step],
+        plans.num_actions,
+        action_names=plans.action_names,
         context=context,
         group=plans.group[plan] if plans.group is not None and grouped else units(plans, start_here)[plan, start],
+        context_names=plans.context_names,
         group_names=plans.group_names if grouped else None,
-        durations=None,
-        condition=None,
-        condition_names=None,
-        plan_names=None,
+        end=plans.end,
     )

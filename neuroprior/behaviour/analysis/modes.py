@@ -17,7 +17,7 @@ from neuroprior._random import draw_seed, generator_on
 from neuroprior.behaviour.analysis.comparison import Score, action_bits, score_bits
 from neuroprior.plans import Plans, constant_context
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, num_units
-from neuroprior.plans.plans import check_are_plans
+from neuroprior.plans.plans import AnyPlans, check_are_plans
 from neuroprior.priors import SwitchingPrior
 from neuroprior.priors.construction import context_arguments
 from neuroprior.priors.fitting import make_prior
@@ -209,7 +209,7 @@ def _scored(prior: SwitchingPrior, plans: Plans) -> Plans:
     return plans_for(prior, plans)
 
 
-def mode_plans(prior: SwitchingPrior, plans: Plans) -> Plans:
+def mode_plans(prior: SwitchingPrior, plans: AnyPlans) -> AnyPlans:
     """The most probable modes behind plans, as plans whose actions are modes.
 
     So all analyses of plans apply to modes: `transitions`, `compare_conditions`, the ethogram.
@@ -248,7 +248,7 @@ def mode_transitions(prior: SwitchingPrior, plans: Plans) -> Tensor:
 def mode_frame(prior: SwitchingPrior, plans: Plans) -> Any:
     """The modes behind each action, as a pandas frame with a row an action.
 
-    `plan`, and `group` and `condition` where there are any (by name, or numbers); `step`, from 0; `context`, where it
+    `plan`, and `group` and whatever else a plan has one of (by name, or numbers); `step`, from 0; `context`, where it
     is an index; `action`; `mode`, the most probable path's, from 1; and for each mode k `filtered_k`, its probability
     given the actions so far, and `smoothed_k`, given the whole plan.
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from neuroprior._random import generator_on
-from neuroprior.plans import Plans
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.plans.columns import listed
 
 Kind = Literal["between", "within"]
@@ -53,7 +53,7 @@ class PermutationDesign:
     odd: str = ""
 
     @staticmethod
-    def of(plans: Plans) -> "PermutationDesign":
+    def of(plans: RecordedPlans) -> "PermutationDesign":
         """The design of `plans`.
 
         Raises:

@@ -19,9 +19,9 @@ from neuroprior.behaviour.durations.laws import (
     fit_laws,
     resolution,
 )
+from neuroprior.behaviour.recorded_plans import RecordedPlans, durations_of
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, num_units
-from neuroprior.plans.plans import durations_of
 from neuroprior.priors.prior import as_actions
 from neuroprior.priors.saved import SavedModule
 
@@ -80,7 +80,8 @@ class DurationModel(SavedModule):
 
     Example:
         >>> durations = torch.tensor([[1.0, 4.0, 1.2, 3.5]]).repeat(20, 1) * torch.linspace(0.5, 2, 20)[:, None]
-        >>> model = DurationModel(2).fit(Plans(torch.tensor([[0, 1, 0, 1]]).repeat(20, 1), 2, durations=durations))
+        >>> actions = torch.tensor([[0, 1, 0, 1]]).repeat(20, 1)
+        >>> model = DurationModel(2).fit(RecordedPlans(actions, 2, durations=durations))
         >>> model.num_actions
         2
     """
@@ -129,7 +130,7 @@ class DurationModel(SavedModule):
         return found
 
     @torch.no_grad()
-    def fit(self, plans: Plans) -> Self:
+    def fit(self, plans: RecordedPlans) -> Self:
         """Fit and choose the laws anew; returns self. Nothing is drawn at random.
 
         Args:
@@ -222,7 +223,7 @@ class DurationModel(SavedModule):
         """What a law `[K]` must gain, in nats."""
         return NATS_A_PARAMETER * torch.tensor([float(len(LAWS[name].names)) for name in self.laws]).double()
 
-    def log_prob(self, plans: Plans) -> Tensor:
+    def log_prob(self, plans: RecordedPlans) -> Tensor:
         """The log-density of each known duration, given its action and the next one; of a 0, its log-probability.
 
         Args:
@@ -302,7 +303,7 @@ class DurationModel(SavedModule):
         after = plans.actions.long().masked_fill(~plans.mask(), -1)
         return functional.pad(after[:, 1:], (0, min(plans.max_length, 1)), value=-1)
 
-    def _known(self, plans: Plans) -> Tensor:
+    def _known(self, plans: RecordedPlans) -> Tensor:
         return plans.mask(end=False) & ~durations_of(plans).isnan()
 
     def _check(self, plans: Plans, durations: bool = True) -> None:

@@ -11,6 +11,7 @@ from neuroprior._checks import check_same_names
 from neuroprior._random import generator_on
 from neuroprior.behaviour.durations.duration_model import DurationModel
 from neuroprior.behaviour.durations.laws import LAW_NAMES, LawName
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.plans import Plans
 from neuroprior.priors.construction import as_prior, construct, described
 from neuroprior.priors.counts import MarkovPrior
@@ -23,7 +24,7 @@ class SemiMarkovPrior(Prior):
 
     With a Markov chain as its action prior it is a semi-Markov process (Howard 1971, Dynamic probabilistic systems,
     volume 2, chapter 10): the time spent in an action depends on this action and the next one. The next action does not
-    depend on the times; for a neural prior that knows the last ones see `neuroprior.plans.PastDurations`.
+    depend on the times; for a neural prior that knows the last ones see `PastDurations`.
 
     It is an action prior to all that samples or scores actions: `start`, `step`, `forward`, `log_prob` and `sample` are
     those of `actions`. `sample_plans` gives plans with durations; the log-density of plans with their durations is
@@ -42,7 +43,7 @@ class SemiMarkovPrior(Prior):
 
     Example:
         >>> durations = torch.tensor([[1.0, 4.0, 1.2, 3.5]]).repeat(20, 1) * torch.linspace(0.5, 2, 20)[:, None]
-        >>> plans = Plans(torch.tensor([[0, 1, 0, 1]]).repeat(20, 1), 2, durations=durations)
+        >>> plans = RecordedPlans(torch.tensor([[0, 1, 0, 1]]).repeat(20, 1), 2, durations=durations)
         >>> prior = SemiMarkovPrior(2).fit(plans)
         >>> prior.sample(3, 4, generator=torch.Generator().manual_seed(0)).shape
         torch.Size([3, 4])
@@ -114,17 +115,17 @@ class SemiMarkovPrior(Prior):
         """
         self.check_settings(settings)
         plans = training_plans(self, plans)
-        self.durations.fit(plans)
+        self.durations.fit(RecordedPlans.of(plans))
         self.actions.fit(plans_for(self.actions, plans), generator=generator, **settings)
         return self
 
     def recount(self, plans: Plans) -> Self:
         plans = counted_plans(self, plans)
-        self.durations.fit(plans)
+        self.durations.fit(RecordedPlans.of(plans))
         self.actions.recount(plans)
         return self
 
-    def duration_log_prob(self, plans: Plans) -> Tensor:
+    def duration_log_prob(self, plans: RecordedPlans) -> Tensor:
         """The log-density of the known durations of plans, given their actions; see `DurationModel.log_prob`.
 
         Args:
@@ -147,7 +148,7 @@ class SemiMarkovPrior(Prior):
         *,
         temperature: float = 1.0,
         generator: torch.Generator | None = None,
-    ) -> Plans:
+    ) -> RecordedPlans:
         """Independent plans with durations, the names of the actions, and the context.
 
         Args:
@@ -161,7 +162,7 @@ class SemiMarkovPrior(Prior):
         """
         generator = generator_on(generator, self.device)
         actions = self.sample(num_plans, length, context, temperature=temperature, generator=generator)
-        plans = Plans(
+        plans = RecordedPlans(
             actions,
             self.num_actions,
             action_names=self.action_names,

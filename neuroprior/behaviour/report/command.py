@@ -11,7 +11,7 @@ from rich.console import Console
 from neuroprior.behaviour.report.document import show
 from neuroprior.behaviour.report.options import INPUTS, FitOptions, InputName, ModelName, ReadOptions
 from neuroprior.behaviour.report.plan_report import report
-from neuroprior.plans.columns import Columns, Missing
+from neuroprior.behaviour.tables import Columns, Missing
 from neuroprior.priors.ensembles.candidates import Effort
 
 

@@ -79,7 +79,7 @@ def _text(result: ConditionComparison) -> list[str]:
 
 def _unit_names(result: ConditionComparison, found: Evaluation) -> list[str]:
     if result.design.item == "plans":
-        names = found.plans.plan_names or ()
+        names = found.plans.recording or ()
         distinct = len(set(names)) == len(found.plans)
         return [names[number] if distinct else f"plan {number}" for number in result.design.units.tolist()]
     return group_names(found.plans, result.design.units)

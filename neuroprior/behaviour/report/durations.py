@@ -13,6 +13,7 @@ from neuroprior._statistics import ENOUGH_UNITS, ratio_difference
 from neuroprior.behaviour.analysis.comparison import Score, score_bits, unit_name
 from neuroprior.behaviour.durations.duration_model import DurationModel
 from neuroprior.behaviour.durations.laws import resolution
+from neuroprior.behaviour.recorded_plans import RecordedPlans, durations_of
 from neuroprior.behaviour.report import figures
 from neuroprior.behaviour.report.document import Column, table
 from neuroprior.behaviour.report.fits import ACTIONS, DURATIONS
@@ -21,7 +22,6 @@ from neuroprior.behaviour.report.part import LISTED, Part, action_names, p_text
 from neuroprior.behaviour.report.scores import Evaluation
 from neuroprior.plans import BLOCKS, FEWEST_UNITS, Plans, divisible, folds, in_parts
 from neuroprior.plans.folds import num_units
-from neuroprior.plans.plans import durations_of
 from neuroprior.priors import MarkovPrior
 from neuroprior.priors.counts.markov import blend
 
@@ -103,7 +103,7 @@ def duration_section(found: Evaluation) -> Part | None:
     return Part(Section("Durations", text, tables, [box]), frames)
 
 
-def _parts(plans: Plans, known: Tensor) -> Iterator[tuple[Plans, Tensor]]:
+def _parts(plans: RecordedPlans, known: Tensor) -> Iterator[tuple[RecordedPlans, Tensor]]:
     """The training plans, and the numbers of the held-out ones, of each fold whose training plans have durations."""
     plans = divisible(plans)
     number = num_units(plans)
@@ -112,7 +112,7 @@ def _parts(plans: Plans, known: Tensor) -> Iterator[tuple[Plans, Tensor]]:
             yield plans[training], held_out
 
 
-def _held_out_gains(plans: Plans, known: Tensor) -> dict[str, Tensor]:
+def _held_out_gains(plans: RecordedPlans, known: Tensor) -> dict[str, Tensor]:
     """`[N, L]`, nats: what the law of each action gains over an exponential one, and laws of transitions over that.
 
     NaN where there is no held-out duration above 0.
@@ -122,7 +122,8 @@ def _held_out_gains(plans: Plans, known: Tensor) -> dict[str, Tensor]:
     for training, held_out in _parts(plans, known):
         part, here = plans[held_out], above[held_out]
         # Each action as a plan of its own has no next action: its law is that of the action.
-        alone = Plans(part.actions[here][:, None], plans.num_actions, durations=durations_of(part)[here][:, None])
+        times = durations_of(part)[here][:, None]
+        alone = RecordedPlans(part.actions[here][:, None], plans.num_actions, durations=times)
         model = DurationModel(plans.num_actions).fit(training)
         plain = DurationModel(plans.num_actions, ["exponential"], transitions=False).fit(training)
         own = model.log_prob(alone)[:, 0]
@@ -132,7 +133,7 @@ def _held_out_gains(plans: Plans, known: Tensor) -> dict[str, Tensor]:
     return found
 
 
-def _by_unit(values: Tensor, plans: Plans, mask: Tensor) -> dict[str, float]:
+def _by_unit(values: Tensor, plans: RecordedPlans, mask: Tensor) -> dict[str, float]:
     """The mean of `values [N, L]` where they are finite and in `mask`, with its interval over independent units."""
     mask = mask & values.isfinite()
     nothing = {"gain": np.nan, "low": np.nan, "high": np.nan, "p_value": np.nan, "units": 0}
@@ -143,7 +144,7 @@ def _by_unit(values: Tensor, plans: Plans, mask: Tensor) -> dict[str, float]:
     return {"gain": gain, "low": low, "high": high, "p_value": p_value, "units": len(score.bits)}
 
 
-def _by_action(plans: Plans, known: Tensor, model: DurationModel, gains: dict[str, Tensor]) -> pd.DataFrame:
+def _by_action(plans: RecordedPlans, known: Tensor, model: DurationModel, gains: dict[str, Tensor]) -> pd.DataFrame:
     """A row an action, the commonest first: its durations, their law, and what this gains over an exponential one."""
     names, taken = action_names(plans), plans.mask()
     laws = model.table()
@@ -165,7 +166,7 @@ def _by_action(plans: Plans, known: Tensor, model: DurationModel, gains: dict[st
     return pd.DataFrame(rows)
 
 
-def _laws(plans: Plans, known: Tensor, model: DurationModel, gains: dict[str, Tensor]) -> pd.DataFrame:
+def _laws(plans: RecordedPlans, known: Tensor, model: DurationModel, gains: dict[str, Tensor]) -> pd.DataFrame:
     """What laws of actions gain over exponential ones, and laws of transitions over those of actions."""
     number = len({row.action for row in model.table() if row.next_action is not None})
     names = {
@@ -175,7 +176,7 @@ def _laws(plans: Plans, known: Tensor, model: DurationModel, gains: dict[str, Te
     return pd.DataFrame([{"what": name} | _by_unit(gains[what], plans, known) for what, name in names.items()])
 
 
-def _following(found: Evaluation, plans: Plans, known: Tensor) -> pd.DataFrame:
+def _following(found: Evaluation, plans: RecordedPlans, known: Tensor) -> pd.DataFrame:
     """Bits per action with and without the last duration known: of a chain, and of networks that took them."""
     rows = []
     if plans.num_actions <= MOST_ACTIONS:
@@ -196,7 +197,7 @@ def _compared(without: Score, known: Score) -> dict[str, Any]:
     return bits | {"gain": gain, "low": low, "high": high, "p_value": p_value, "units": len(known.bits)}
 
 
-def chain_bits(plans: Plans, known: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
+def chain_bits(plans: RecordedPlans, known: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
     """The held-out bits of each action under a chain of order 1, and under one that knows the last duration.
 
     The second counts the actions after each action with each class of its duration, and backs off to the first with
@@ -228,7 +229,7 @@ def chain_bits(plans: Plans, known: Tensor) -> tuple[tuple[Tensor, Tensor], Tens
     return (without, knowing), mask
 
 
-def _edges(plans: Plans) -> Tensor:
+def _edges(plans: RecordedPlans) -> Tensor:
     """`[A, CLASSES - 1]`: the quantiles of the known durations of each action that divide it into classes."""
     known = plans.mask() & ~durations_of(plans).isnan()
     times = pd.DataFrame({"action": plans.actions[known].tolist(), "time": durations_of(plans)[known].tolist()})
@@ -237,7 +238,7 @@ def _edges(plans: Plans) -> Tensor:
     return torch.tensor(found.fillna(np.inf).to_numpy(np.float64))
 
 
-def _pairs(plans: Plans, edges: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _pairs(plans: RecordedPlans, edges: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Of each action after a known duration: the last action, the class of its duration, the action; and where."""
     times = durations_of(plans)[:, :-1]
     here = plans.mask()[:, 1:] & ~times.isnan()
@@ -253,7 +254,7 @@ def _evidence(counts: Tensor, lower: Tensor, weight: float) -> float:
     return float((torch.lgamma(torch.tensor(weight).double()) - torch.lgamma(total + weight)).sum() + own.sum())
 
 
-def dwell_times(plans: Plans, model: DurationModel) -> pd.DataFrame:
+def dwell_times(plans: RecordedPlans, model: DurationModel) -> pd.DataFrame:
     """Histograms of durations above 0 with the fitted laws: the table that `dwell_figure` draws.
 
     Args:

@@ -18,6 +18,7 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.report.drawing import (
     FEWER,
     MORE,
@@ -350,10 +351,10 @@ def ethogram_figure(plans: Plans) -> Figure:
     Time is the sum of the durations, in their unit, where plans have them; else a step is an action. A duration that is
     not known is left blank, as long as the median one. Of actions shorter than one of `MOST_BINS` parts of the longest
     plan some are not drawn. At most `MOST_ROWS` plans are drawn, evenly spaced; the figure says so. The parts of a plan
-    that was cut at gaps (plans of one name and group) are in one row, in their order, with a blank between them.
+    that was cut at gaps (plans of one recording and group) are in one row, in their order, with a blank between them.
 
     Args:
-        plans: with names of actions and plans, groups, conditions and durations where there are any.
+        plans: with names of actions and recordings, groups, conditions and durations where there are any.
 
     Raises:
         ValueError: no plan has an action.
@@ -364,7 +365,7 @@ def ethogram_figure(plans: Plans) -> Figure:
         ... ).savefig("ethogram.png")
     """
     check_are_plans(plans)
-    plans = plans if plans.end is None else plans.without_end()
+    plans = RecordedPlans.of(plans if plans.end is None else plans.without_end())
     mask = plans.mask().cpu().numpy()
     if not mask.any():
         raise ValueError("`plans` must have at least one action: without any there is no figure.")
@@ -412,18 +413,18 @@ def ethogram_figure(plans: Plans) -> Figure:
     return figure
 
 
-def _rows_of(plans: Plans, index: NDArray[np.int64]) -> NDArray[np.int64]:
+def _rows_of(plans: RecordedPlans, index: NDArray[np.int64]) -> NDArray[np.int64]:
     """The row of an ethogram of each of some plans, numbered from 0: parts of one plan have the same."""
-    if plans.plan_names is None:
+    if plans.recording is None:
         return np.arange(len(index))
-    names = np.unique(np.array(plans.plan_names, dtype=str)[index], return_inverse=True)[1]
+    names = np.unique(np.array(plans.recording, dtype=str)[index], return_inverse=True)[1]
     group = np.zeros(len(index), np.int64) if plans.group is None else plans.group.cpu().numpy()[index]
     _, first, row = np.unique(np.stack([names, group]), axis=1, return_index=True, return_inverse=True)
     rows: NDArray[np.int64] = np.argsort(np.argsort(first))[row.reshape(-1)]  # in the order of the plans
     return rows
 
 
-def _over_time(plans: Plans, row: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
+def _over_time(plans: RecordedPlans, row: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
     """The action `[R, bins]` in R rows at evenly spaced times, A for none, and how long the longest row takes.
 
     Args:

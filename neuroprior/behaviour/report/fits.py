@@ -12,9 +12,10 @@ from torch import Tensor
 from neuroprior._version import __version__
 from neuroprior.behaviour.analysis.comparison import Score, action_bits, baselines, score_bits
 from neuroprior.behaviour.analysis.lags import pieces
+from neuroprior.behaviour.durations.past_durations import PastDurations
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, fair_split, folds, num_units
-from neuroprior.plans.past_durations import PastDurations
+from neuroprior.plans.plans import AnyPlans
 from neuroprior.priors import CombinedPrior, GRUPrior, MarkovPrior, Prior, StackedPrior, TransformerPrior
 from neuroprior.priors.construction import construct, context_arguments
 from neuroprior.priors.counts import TooLargeError
@@ -102,7 +103,7 @@ def counted(plans: Plans, skip: int, cut: bool = False) -> Tensor:
     return mask
 
 
-def split(plans: Plans, test: Plans | None, design: Design, fold: int) -> tuple[Plans, Tensor]:
+def split(plans: AnyPlans, test: Plans | None, design: Design, fold: int) -> tuple[AnyPlans, Tensor]:
     """The training plans of a fold, and the numbers of the plans that are scored."""
     if test is not None:
         return plans, torch.arange(len(test))

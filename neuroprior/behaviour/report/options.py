@@ -1,12 +1,18 @@
 """Options of a report on plans: how their file is read, and which models are fitted to them."""
 
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any, Literal
 
 from neuroprior._checks import check_sizes
-from neuroprior.plans import Plans, read_plans
-from neuroprior.plans.columns import Columns, Missing
+from neuroprior.behaviour.recorded_plans import RecordedPlans
+from neuroprior.behaviour.tables import Columns, Missing, read_events
+from neuroprior.plans import Plans, constant_context, read_plans
+from neuroprior.plans.columns import check_names
+from neuroprior.plans.io import MINARI, is_table
+from neuroprior.plans.io.npz import read_npz
 from neuroprior.priors.ensembles.candidates import Effort, check_effort
 
 ModelName = Literal["counts", "gru", "transformer", "stacked", "combined"]
@@ -45,9 +51,47 @@ class ReadOptions:
     num_actions: int | None = None
     action_names: Sequence[str] | None = None
 
-    def read(self, file: str) -> Plans:
-        """Reads the plans of a file; see `neuroprior.read_plans`."""
-        return read_plans(file, **vars(self))
+    def read(self, file: str) -> RecordedPlans:
+        """Reads the plans of a file: of a table with `read_events`, of others with `neuroprior.read_plans`.
+
+        What its reader warns of stands in the notes of the plans.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: an option or the file is wrong.
+        """
+        if is_table(file):
+            plans = read_events(file, **vars(self))
+            return replace(plans, notes=(*plans.notes, *_feature_notes(plans)))
+        of_tables = ("columns", "missing", "merge_repeats", "max_gap")
+        if given := [name for name in of_tables if getattr(self, name) != DEFAULTS[name]]:
+            raise ValueError(f"{given[0]}: for CSV files only, not for {file}")
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always", UserWarning)
+            plans = _read_recorded(file, self.num_actions, self.action_names)
+        notes = [str(one.message).removeprefix(f"{file}: ") for one in warned]
+        return replace(plans, notes=(*plans.notes, *notes, *_feature_notes(plans)))
+
+
+DEFAULTS = {field.name: field.default for field in fields(ReadOptions)}
+
+
+def _read_recorded(file: str, num_actions: int | None, action_names: Sequence[str] | None) -> RecordedPlans:
+    """The plans of a file that is no table; of a `.npz` file with what it holds of recordings."""
+    if Path(file).suffix.lower() == ".npz" and not file.startswith(MINARI):
+        return read_npz(Path(file), num_actions, check_names(num_actions, action_names), RecordedPlans)
+    return RecordedPlans.of(read_plans(file, num_actions=num_actions, action_names=action_names))
+
+
+def _feature_notes(plans: Plans) -> list[str]:
+    """A note where features of plans may have been meant as one feature of each action, as many as these."""
+    features, length = constant_context(plans), plans.max_length
+    if features is None or not features.is_floating_point() or not 1 < features.shape[1] == length:
+        return []
+    return [
+        f"context: {length} features of each plan, known from its first action on; if it is one feature of each of the"
+        f" {length} actions, give [N, {length}, 1], lists of one number each"
+    ]
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,8 @@ import torch
 from neuroprior._checks import check_count
 from neuroprior._jobs import Progress
 from neuroprior._threads import one_thread
+from neuroprior.behaviour.durations.past_durations import PastDurations
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.report.document import Document, check_place, write_document
 from neuroprior.behaviour.report.fits import ACTIONS, CONTEXT, DURATIONS, LAGS, OF_FEATURES, Design, counted
 from neuroprior.behaviour.report.options import FitOptions, ReadOptions, check_choices
@@ -19,6 +21,7 @@ from neuroprior.behaviour.report.sections import SECTIONS, describe
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
 from neuroprior.plans.io import is_table
+from neuroprior.plans.plans import AnyPlans
 from neuroprior.priors import Prior, load
 from neuroprior.priors.matching import learned_names, renumbered
 from neuroprior.priors.scoring import learned_from
@@ -99,11 +102,13 @@ def _score_saved(
     if isinstance(priors, Prior | str) or not priors or any(isinstance(one, Prior) for one in priors):
         raise ValueError("`priors` must be a dict of fitted priors by name, or a list of folders, with one at least.")
     loaded = dict(priors) if isinstance(priors, Mapping) else {folder: load(folder) for folder in priors}
+    folders = [] if isinstance(priors, Mapping) else [*priors]
+    past = {folder: one for folder in folders if (one := PastDurations.load(Path(folder))) is not None}
     table = not isinstance(plans, Plans) and is_table(str(plans))
     if table and reading.action_names is None:
         reading = replace(reading, action_names=learned_names(next(iter(loaded.values()))))
-    found = evaluate_saved(loaded, _read(plans, reading), skip, table)
-    known = {} if isinstance(priors, Mapping) else {one: sum(learned_from(Path(one), found.plans)) for one in priors}
+    found = evaluate_saved(loaded, _read(plans, reading), skip, table, past)
+    known = {folder: sum(learned_from(Path(folder), found.plans)) for folder in folders}
     if not any(known.values()):
         return found
     return replace(found, settings=found.settings | {"training data": {name: n for name, n in known.items() if n}})
@@ -159,7 +164,7 @@ def _cross_validate(
     return replace(found, plans=whole, settings=settings)
 
 
-def _inputs(fits: FitOptions, kinds: Sequence[str], learned: Plans, scored: Plans) -> list[str]:
+def _inputs(fits: FitOptions, kinds: Sequence[str], learned: RecordedPlans, scored: RecordedPlans) -> list[str]:
     """The inputs that plans have of those that are asked for."""
     found = [ACTIONS] * ("actions" in fits.inputs)
     found += [CONTEXT] * ("context" in fits.inputs and learned.context is not None)
@@ -216,14 +221,13 @@ def _finding(found: Evaluation) -> str:
     return f"{found.best.label} takes {fewest}{bits:.3f} {interval}; {found.too_few}."
 
 
-def _read(plans: Plans | str | Path, reading: ReadOptions) -> Plans:
+def _read(plans: Plans | str | Path, reading: ReadOptions) -> RecordedPlans:
     """The plans, without an end symbol."""
-    if not isinstance(plans, Plans):
-        plans = reading.read(str(plans))
+    plans = RecordedPlans.of(plans) if isinstance(plans, Plans) else reading.read(str(plans))
     return plans if plans.end is None else plans.without_end()
 
 
-def _with_actions(plans: Plans | str | Path, reading: ReadOptions) -> tuple[Plans, int]:
+def _with_actions(plans: Plans | str | Path, reading: ReadOptions) -> tuple[RecordedPlans, int]:
     """The plans that have actions, and how many have none: these are of no use to models."""
     read, file = _read(plans, reading), "plans" if isinstance(plans, Plans) else plans
     if read.num_actions > MOST_ACTIONS:
@@ -236,7 +240,7 @@ def _with_actions(plans: Plans | str | Path, reading: ReadOptions) -> tuple[Plan
     return read[some], int((~some).sum())
 
 
-def _in_parts(plans: Plans) -> tuple[Plans, bool]:
+def _in_parts(plans: AnyPlans) -> tuple[AnyPlans, bool]:
     """The plans, a single one cut into consecutive parts; and whether it was."""
     if len(plans) > 1:
         return plans, False
@@ -255,7 +259,7 @@ def _folds(name: str, plans: Plans, fits: FitOptions) -> int:
     return number
 
 
-def _contexts_from_0(plans: Plans, test: Plans | None) -> tuple[Plans, Plans | None]:
+def _contexts_from_0(plans: AnyPlans, test: AnyPlans | None) -> tuple[AnyPlans, AnyPlans | None]:
     """The plans with the contexts that occur numbered from 0, where they have no names: gaps make no model larger."""
     contexts = [some.context for some in (plans, test) if some is not None and some.context is not None]
     named = plans.context_names is not None or (test is not None and test.context_names is not None)
@@ -270,7 +274,7 @@ def _contexts_from_0(plans: Plans, test: Plans | None) -> tuple[Plans, Plans | N
     return replace(plans, context=new[0]), None if test is None else replace(test, context=new[-1])
 
 
-def _numbered_alike(plans: Plans, test: Plans, name: str) -> Plans:
+def _numbered_alike(plans: Plans, test: AnyPlans, name: str) -> AnyPlans:
     """The test plans with actions and contexts numbered as in those that are learned from."""
     of_plans, of_test = _kind_of_context(plans), _kind_of_context(test)
     if of_plans != of_test:

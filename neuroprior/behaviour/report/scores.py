@@ -16,6 +16,8 @@ from torch import Tensor
 from neuroprior._files import written_whole
 from neuroprior._jobs import JobRun
 from neuroprior.behaviour.analysis.comparison import Score, action_bits, score_bits, too_few, unit_name
+from neuroprior.behaviour.durations.past_durations import PastDurations
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.report import fits
 from neuroprior.behaviour.report.fits import (
     ACTIONS,
@@ -33,7 +35,6 @@ from neuroprior.behaviour.report.fits import (
     counted,
     split,
 )
-from neuroprior.plans import Plans
 from neuroprior.plans.sequences import plans_digest
 from neuroprior.priors import Prior
 from neuroprior.priors.ensembles.candidates import ORDERS
@@ -69,12 +70,12 @@ class Model:
 class Evaluation:
     """All that a report is made of."""
 
-    plans: Plans  # those that are described
-    scored: Plans  # those on which models were scored, N of them
+    plans: RecordedPlans  # those that are described
+    scored: RecordedPlans  # those on which models were scored, N of them
     mask: Tensor  # [N, L] bool: their actions that count
     models: Sequence[Model]  # in the order of the main table
     reference: tuple[Model, str]  # the model that the others are compared with, and its name in the report
-    first_fold: Plans  # the plans that are held out in the first fold
+    first_fold: RecordedPlans  # the plans that are held out in the first fold
     gains: pd.DataFrame  # the information by lag that models give
     settings: dict[str, Any]  # how it was made
 
@@ -111,7 +112,9 @@ class Evaluation:
         return pd.DataFrame(rows).assign(how=[model.how for model in self.models])
 
 
-def cross_validation(folder: Path, plans: Plans, test: Plans | None, design: Design) -> JobRun[Job, Arrays]:
+def cross_validation(
+    folder: Path, plans: RecordedPlans, test: RecordedPlans | None, design: Design
+) -> JobRun[Job, Arrays]:
     """The jobs of a cross-validation, whose results are kept below `folder` by the plans and the design."""
     asked = {"plans": plans_digest(plans), "test": None if test is None else plans_digest(test), **asdict(design)}
     run = partial(fits.fit_and_score, plans, test, design)
@@ -132,7 +135,9 @@ def jobs(design: Design, kinds: Iterable[str], inputs: Iterable[str]) -> list[Jo
     ]
 
 
-def evaluate(plans: Plans, test: Plans | None, design: Design, todo: Sequence[Job], found: list[Arrays]) -> Evaluation:
+def evaluate(
+    plans: RecordedPlans, test: RecordedPlans | None, design: Design, todo: Sequence[Job], found: list[Arrays]
+) -> Evaluation:
     """The results of finished jobs, put together."""
     scored = plans if test is None else test
     mask = counted(scored, design.skip, design.cut)
@@ -177,7 +182,13 @@ def _gains(arrays: Arrays, inputs: str) -> list[dict[str, Any]]:
     return rows
 
 
-def evaluate_saved(priors: Mapping[str, Prior], plans: Plans, skip: int, is_table: bool = False) -> Evaluation:
+def evaluate_saved(
+    priors: Mapping[str, Prior],
+    plans: RecordedPlans,
+    skip: int,
+    is_table: bool = False,
+    past_durations: Mapping[str, PastDurations] | None = None,
+) -> Evaluation:
     """Fitted priors, scored on plans whose actions and contexts they know by name, else by number, which is noted.
 
     Args:
@@ -185,6 +196,7 @@ def evaluate_saved(priors: Mapping[str, Prior], plans: Plans, skip: int, is_tabl
         plans: to score.
         skip: actions at the beginning of each plan that do not count.
         is_table: whether the plans were read from a table (CSV), in which names of contexts may be numbers.
+        past_durations: of those priors that were trained with durations as features, by their names.
 
     Raises:
         ValueError: a prior does not know these actions or contexts; the message has its name.
@@ -196,8 +208,10 @@ def evaluate_saved(priors: Mapping[str, Prior], plans: Plans, skip: int, is_tabl
             said.append(numbered_note("actions", plans.action_names))
         notes += [f"{name}: {one}" for one in said]
         own = match_plans(given, prior, name)
-        mask, inputs = counted(own, skip), CONTEXT if prior.takes_context else ACTIONS
-        inputs = inputs if prior.past_durations is None else DURATIONS
+        inputs = CONTEXT if prior.takes_context else ACTIONS
+        if past_durations is not None and name in past_durations:
+            own, inputs = past_durations[name].added_to(own), DURATIONS
+        mask = counted(own, skip)
         try:
             bits = action_bits(prior, own)
             models.append(Model(name, inputs, type(prior).__name__, bits, score_bits(name, inputs, bits, own, mask)))

@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from neuroprior._statistics import ENOUGH_UNITS
-from neuroprior.behaviour.analysis.comparison import never_taken, too_few, unit_name, units
+from neuroprior.behaviour.analysis.comparison import never_occur, never_taken, too_few, unit_name, units
 from neuroprior.behaviour.analysis.drift import action_drift, by_group, by_plan, by_position
 from neuroprior.behaviour.analysis.lags import mutual_information
 from neuroprior.behaviour.analysis.motifs import motifs
 from neuroprior.behaviour.analysis.transitions import transitions
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.report import figures
 from neuroprior.behaviour.report.conditions import condition_section
 from neuroprior.behaviour.report.document import Column, table
@@ -24,7 +25,6 @@ from neuroprior.behaviour.report.page import FigureBox, Section
 from neuroprior.behaviour.report.part import LISTED, SIGNIFICANT, Part, action_names, group_names, p_text
 from neuroprior.behaviour.report.scores import Evaluation
 from neuroprior.plans import Plans, constant_context, has_patterns
-from neuroprior.plans.columns import never_occur
 
 MOST_LAG = 20
 LISTED_LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 20)
@@ -60,7 +60,7 @@ def file_section(found: Evaluation) -> Part:
     return Part(Section("Plans", tables=tables, figures=boxes), {"actions": frame})
 
 
-def action_frame(plans: Plans) -> pd.DataFrame:
+def action_frame(plans: RecordedPlans) -> pd.DataFrame:
     """How often each action occurs, in how many plans, and its median duration; the commonest first."""
     mask = plans.mask()
     plan = mask.nonzero()[:, 0]
@@ -75,7 +75,7 @@ def action_frame(plans: Plans) -> pd.DataFrame:
     return frame if plans.durations is not None else frame.drop(columns="median_duration")
 
 
-def describe(plans: Plans) -> dict[str, Any]:
+def describe(plans: RecordedPlans) -> dict[str, Any]:
     """How many plans there are, of which lengths, with which context."""
     lengths = plans.mask().sum(1)
     context = "none"

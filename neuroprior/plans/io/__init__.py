@@ -1,17 +1,18 @@
 """Reading and writing plans: one function each for all kinds of files; datasets of Minari; trajectories in memory."""
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from neuroprior.plans.columns import Columns, Missing, check_names
+from neuroprior.plans.columns import check_names
 from neuroprior.plans.io.csv import read_csv, write_csv
 from neuroprior.plans.io.jsonl import read_jsonl, write_jsonl
 from neuroprior.plans.io.minari import read_minari, write_minari
 from neuroprior.plans.io.npz import read_npz, write_npz
 from neuroprior.plans.io.trajectories import from_trajectories, to_trajectories
-from neuroprior.plans.plans import Plans, check_are_plans, has_patterns
+from neuroprior.plans.plans import Plans, check_are_plans, check_plain_plans, has_patterns
 
 __all__ = ["from_trajectories", "read_minari", "read_plans", "to_trajectories", "write_minari", "write_plans"]
 
@@ -30,7 +31,7 @@ FILES = {
     ".csv": FileKind(read_csv, write_csv),
     ".tsv": FileKind(read_csv, write_csv),
     ".jsonl": FileKind(read_jsonl, write_jsonl),
-    ".npz": FileKind(read_npz, write_npz),
+    ".npz": FileKind(partial(read_npz, kind=Plans), write_npz),
 }
 """The kinds of files, by suffix."""
 
@@ -40,27 +41,20 @@ def read_plans(
     *,
     num_actions: int | None = None,
     action_names: Sequence[str] | None = None,
-    columns: Columns | Mapping[str, Any] | None = None,
-    missing: Missing = "gap",
-    merge_repeats: bool = False,
-    max_gap: float | None = None,
 ) -> Plans:
     """Plans of a file, by its suffix, or of a Minari dataset: `minari:` and its name, see `read_minari`.
 
     - `.npz`: arrays named like the attributes of `Plans`; only `actions [N, L]` is required. Nothing is unpickled.
     - `.jsonl`: one plan a line, an object with `actions`, a list of integers or of names, and optionally `context`,
-      `plan` (its name), `group`, `condition` and `durations`, a list of numbers; other keys are ignored. A context is
-      an integer or a name; a list of these, one for each action; features of the plan, a list of numbers (at least one
-      in the file with a decimal point, else all are taken for integers); or features of each step, a list of lists; all
-      plans of a file have the same kind. The first line may have, in place of `actions`, any of `num_actions`,
-      `action_names`, `context_names`, `group_names`, `condition_names` and `end`.
-    - `.csv`, `.tsv` (commas, semicolons or tabs) with one action a row: columns `plan` and `action`, and perhaps
-      `context` (or `context_1`, `context_2`, ..., features), `group`, `condition`, `start`, `stop` or `duration`; or
-      other columns, which `columns` names. See `Plans.from_dataframe`. The rows of a plan stand together, in their
-      order, unless there is a `start`.
-    - `.csv`, `.tsv` with one plan a row: columns `action_1`, `action_2`, ..., empty after a plan's end, and perhaps a
-      context, `plan` (its name), `group` and `condition`; or no header, and all cells are actions. A label that is
-      missing before a plan's end is a gap, as with one action a row.
+      `group`; `plan`, its name, is not kept. A context is an integer or a name; a list of these, one for each action;
+      features of the plan, a list of numbers (at least one in the file with a decimal point, else all are taken for
+      integers); or features of each step, a list of lists; all plans of a file have the same kind. The first line may
+      have, in place of `actions`, any of `num_actions`, `action_names`, `context_names`, `group_names` and `end`.
+    - `.csv`, `.tsv` (commas, semicolons or tabs), one plan a row: columns `action_1`, `action_2`, ..., empty after a
+      plan's end, and perhaps `context` (or `context_1`, `context_2`, ..., features) and `group`; other columns are
+      ignored. Or no header, and all cells are actions.
+
+    Tables of events, one action a row, as laboratories record behaviour, are read by `neuroprior.behaviour.read`.
 
     Whole numbers are indices; names are numbered in sorted order. In CSV, groups are names if any of them is not a
     number.
@@ -69,16 +63,16 @@ def read_plans(
         path: the file or dataset.
         num_actions: A; None for what the file says, else the number of names, else the largest action + 1.
         action_names: A names in the order of their numbers; without them the names are sorted.
-        columns: of a CSV file with one action a row: which hold what, if they have other names; `Columns` or a dict.
-        missing, merge_repeats, max_gap: of a CSV file, see `Plans.from_dataframe`.
 
     Returns:
         N plans, padded to the longest: context and group are int64, features float32 (`.npz`: as they are).
 
+    Warns:
+        UserWarning: the file has arrays or keys of other names, which are not used.
+
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: an argument or the file is wrong; the message names the file and the line or the array.
-        ImportError: a file with one action a row needs pandas, and it is not installed.
 
     Example:
         >>> write_plans(
@@ -89,36 +83,24 @@ def read_plans(
     """
     if not isinstance(path, str | os.PathLike):
         raise ValueError(f"`path` must be the name of a file, got {type(path).__name__}")
-    if not isinstance(columns, Columns | Mapping | None):
-        raise ValueError(f"`columns` must say what each holds, as in {{'action': 'behaviour'}}, got {columns!r}")
-    given = columns if isinstance(columns, Columns | None) else {k: v for k, v in columns.items() if v is not None}
-    table: dict[str, Any] = {"columns": given} if given not in (None, {}, Columns()) else {}
-    table |= {"missing": missing} if missing != "gap" else {}
-    table |= {"merge_repeats": merge_repeats} if merge_repeats is not False else {}
-    table |= {} if max_gap is None else {"max_gap": max_gap}
-    is_dataset = isinstance(path, str) and path.startswith(MINARI)
-    if table and (is_dataset or FILES[_suffix(Path(path))].read is not read_csv):
-        raise ValueError(f"{next(iter(table))}: for CSV files only, not for {path}")
-    if isinstance(path, str) and is_dataset:
+    if isinstance(path, str) and path.startswith(MINARI):
         return read_minari(path.removeprefix(MINARI))
     place = Path(path)
     names = check_names(num_actions, action_names)
-    return FILES[_suffix(place)].read(place, num_actions, names, **table)
+    return FILES[_suffix(place)].read(place, num_actions, names)
 
 
-def write_plans(plans: Plans, path: str | os.PathLike[str], *, layout: str | None = None) -> None:
+def write_plans(plans: Plans, path: str | os.PathLike[str]) -> None:
     """Write plans to a file, by its suffix: those that `read_plans` reads. An old file is replaced once it is whole.
 
-    `.npz` and `.jsonl` keep everything. CSV keeps names where there are any, else numbers, but not how many actions are
-    possible: give `num_actions` or `action_names` when reading it. Names of contexts and groups are numbered in sorted
-    order then. In a CSV file with one step a row, a row without an action is between two parts of one plan
-    (`Plans.plan_names`); where such parts do not follow one another, or have no group, plans are numbered, not named.
+    `.npz` keeps everything, also what a subclass of `Plans` adds; `.jsonl` all that `Plans` have. CSV, with one plan a
+    row, holds no context that changes within plans. It keeps names where there are any, else numbers, but not how many
+    actions are possible: give `num_actions` or `action_names` when reading it. Names of contexts and groups are
+    numbered in sorted order then.
 
     Args:
         plans: at least one.
         path: the file.
-        layout: of a CSV file, one "plan" or one "step" a row; None for a step a row if the context is per step, else a
-            plan a row. With "step", a context per plan is repeated on all its rows and read back as one per step.
 
     Raises:
         ValueError: the file cannot hold these plans; the message says why.
@@ -135,10 +117,10 @@ def write_plans(plans: Plans, path: str | os.PathLike[str], *, layout: str | Non
         raise ValueError(f"`path` must be a file, got {type(path).__name__}")
     place = Path(path)
     suffix = _suffix(place)
-    if layout is not None and FILES[suffix].read is not read_csv:
-        raise ValueError(f"layout: for CSV files only, not for {place}")
     if not len(plans):
         raise ValueError(f"{place}: no plans to write")
+    if suffix != ".npz":
+        check_plain_plans(plans, place)
     context = plans.context
     if suffix != ".npz" and context is not None and has_patterns(context):
         raise ValueError(f"{place}: patterns {list(context.shape)} are written to .npz files only")
@@ -147,10 +129,7 @@ def write_plans(plans: Plans, path: str | os.PathLike[str], *, layout: str | Non
             raise ValueError(f"{place}: a context of no features; use None")
         if not context.float().isfinite().all():
             raise ValueError(f"{place}: features too large for the 32 bits in which they are read")
-    if FILES[suffix].read is read_csv:
-        write_csv(plans, place, layout)
-    else:
-        FILES[suffix].write(plans, place)
+    FILES[suffix].write(plans, place)
 
 
 def is_table(path: str | os.PathLike[str]) -> bool:

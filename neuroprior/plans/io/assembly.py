@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from neuroprior.plans.columns import Floats, Integers, Names, as_single, never_notes, padded
-from neuroprior.plans.plans import Plans, action_dtype
+from neuroprior.plans.columns import Floats, Integers, Names, as_single, padded
+from neuroprior.plans.plans import AnyPlans, Plans, action_dtype
 
 
 def assembled(
@@ -46,10 +46,8 @@ def assembled(
         num_actions = len(action_names)
     if num_actions is None and not len(actions):
         raise ValueError(f"{source}: no plan has an action, so num_actions must be given")
-    notes: list[str] = []
     if num_actions is None:
         num_actions = int(actions.max()) + 1
-        notes = never_notes(actions, num_actions)
     dtype = torch.empty(0, dtype=action_dtype(num_actions)).numpy().dtype
     longest = int(lengths.max()) if len(lengths) else 0
     if context is not None:
@@ -67,13 +65,12 @@ def assembled(
             context_names,
             group_names,
             end,
-            notes=tuple(notes),
         )
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from error
 
 
-def renamed(plans: Plans, names: Names | None, source: str) -> Plans:
+def renamed(plans: AnyPlans, names: Names | None, source: str) -> AnyPlans:
     """The same plans with actions numbered as in `names`; those that have no names yet are given them.
 
     Raises:

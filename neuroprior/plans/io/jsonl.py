@@ -1,17 +1,14 @@
 """Plans in JSON lines: one plan a line, `{"actions": [0, 2, 1], "context": 4, "group": "mouse 7"}`."""
 
 import json
-import math
 from array import array
 from bisect import bisect_right
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
-import torch
 
 from neuroprior._files import written_whole
 from neuroprior.plans.columns import (
@@ -24,23 +21,18 @@ from neuroprior.plans.columns import (
     Place,
     check_distinct,
     check_names,
-    feature_notes,
-    listed,
     named,
     open_text,
-    padded,
+    warn_of_unused,
 )
 from neuroprior.plans.io.assembly import assembled, renamed
 from neuroprior.plans.plans import Plans
 from neuroprior.plans.sequences import constant_context
 
-HEADER = ("num_actions", "action_names", "context_names", "group_names", "condition_names", "end")
+HEADER = ("num_actions", "action_names", "context_names", "group_names", "end")
 
-OF_PLANS = ("group", "condition")
-"""What a plan has one of."""
-
-KEYS = {"actions", "context", "durations", "plan", *OF_PLANS}
-"""What a line may hold."""
+KEYS = {"actions", "context", "group", "plan"}
+"""What a line may hold; `plan`, its name in another source, is not kept."""
 
 KINDS = {
     "none": "no context",
@@ -87,20 +79,13 @@ def write_jsonl(plans: Plans, path: Path) -> None:
             if some.context is not None:
                 context = some.context if once is None else once[start : start + 2**14]
                 columns["context"] = named(context.tolist(), plans.context_names)
-            for what in OF_PLANS:
-                values = getattr(some, what)
-                if values is not None:
-                    columns[what] = named(values.tolist(), getattr(plans, f"{what}_names"))
-            if some.plan_names is not None:
-                columns["plan"] = list(some.plan_names)
-            if some.durations is not None:
-                known = some.durations.tolist()
-                columns["durations"] = [[None if time != time else time for time in times] for times in known]
+            if some.group is not None:
+                columns["group"] = named(some.group.tolist(), plans.group_names)
             for length, *values in zip(some.mask().sum(1).tolist(), *columns.values(), strict=True):
                 row = dict(zip(columns, values, strict=True))
-                for key in ("actions", "durations", *(["context"] if once is None else [])):
-                    if key in row:
-                        row[key] = row[key][:length]
+                row["actions"] = row["actions"][:length]
+                if once is None and "context" in row:
+                    row["context"] = row["context"][:length]
                 file.write(json.dumps(row, ensure_ascii=False) + "\n")
 
 
@@ -154,13 +139,11 @@ class _Rows:
         if self.end is not None and type(self.end) is not int:
             raise ValueError(f"`end` must be an action's number, got {_short(self.end)}")
         self.actions = Column("action", self.action_names, None if own is not None else self.num_actions)
-        self.of_plans = {what: Column(what, _header_names(header, f"{what}_names")) for what in OF_PLANS}
+        self.group = Column("group", _header_names(header, "group_names"))
         self.contexts = _Contexts(_header_names(header, "context_names"))
         self.action_kind: type | None = None
-        self.kind_of: dict[str, type] = {}
-        self.durations: array[float] | None = None
+        self.group_kind: type = type(None)
         self.lengths, self.lines = array("q"), array("q")
-        self.plan_names: list[str] = []
         self.unused = dict.fromkeys(header.keys() - {*HEADER})
 
     def add(self, line: int, row: dict[str, Any]) -> None:
@@ -181,47 +164,22 @@ class _Rows:
         if actions and self.action_kind is int and not 0 <= min(actions) <= max(actions) < LARGEST_INTEGER:
             wrong = next(action for action in actions if not 0 <= action < LARGEST_INTEGER)
             raise ValueError(f"action {_short(wrong)} is out of range; 0 or more is expected")
-        for what in OF_PLANS:
-            self._check_entry(what, row.get(what))
-        durations = self._durations(row.get("durations"), len(actions))
-        if (plan_name := row.get("plan")) is not None and type(plan_name) not in (int, str):
-            raise ValueError(f"`plan` must be a name or a number, got {_short(plan_name)}")
-        if (plan_name is not None) != (len(self.plan_names) == len(self.lines)) and self.lines:
-            raise ValueError("`plan` must be a name in every plan, or in none")
+        self._check_group(row.get("group"))
         self.contexts.add(row.get("context"))
         self.actions.add(actions)
-        for what, column in self.of_plans.items():
-            if isinstance(row.get(what), int | str):
-                column.add((row[what],))
-        if self.durations is not None:
-            self.durations.extend(durations)
-        if plan_name is not None:
-            self.plan_names.append(str(plan_name))
+        if isinstance(row.get("group"), int | str):
+            self.group.add((row["group"],))
         self.lengths.append(len(actions))
         self.lines.append(line)
 
-    def _check_entry(self, what: str, entry: Any) -> None:
-        """Check the group or the condition of a plan."""
-        kind = self.kind_of.setdefault(what, type(entry)) if not self.lines else self.kind_of[what]
-        if type(entry) is not kind or kind not in (int, str, type(None)):
-            raise ValueError(f"`{what}` must be an integer or a name in every plan, or in none, got {_short(entry)}")
-        if type(entry) is int and not -LARGEST_INTEGER < entry < LARGEST_INTEGER:
-            raise ValueError(f"{what}: {_short(entry)} is too large")
-
-    def _durations(self, entry: Any, length: int) -> list[float]:
-        """The durations of a plan, NaN for null; none where the plans have none."""
-        if not self.lines and entry is not None:
-            self.durations = array("f")
-        if (entry is None) != (self.durations is None):
-            raise ValueError("`durations` must be a list in every plan, or in none")
-        if entry is None:
-            return []
-        if type(entry) is not list or len(entry) != length:
-            raise ValueError(f"`durations` must be a list of {length} times, one for each action")
-        for value in entry:
-            if value is not None and (type(value) not in (int, float) or not 0 <= value <= LARGEST_FLOAT):
-                raise ValueError(f"`durations` must be times of at least 0, or null, got {_short(value)}")
-        return [math.nan if value is None else value for value in entry]
+    def _check_group(self, group: Any) -> None:
+        """Check the group of a plan."""
+        if not self.lines:
+            self.group_kind = type(group)
+        if type(group) is not self.group_kind or self.group_kind not in (int, str, type(None)):
+            raise ValueError(f"`group` must be an integer or a name in every plan, or in none, got {_short(group)}")
+        if type(group) is int and not -LARGEST_INTEGER < group < LARGEST_INTEGER:
+            raise ValueError(f"group: {_short(group)} is too large")
 
     def plans(self) -> Plans:
         """All plans; ValueError names the line of what is wrong with one."""
@@ -235,8 +193,7 @@ class _Rows:
             return plan(bisect_right(ends, i))
 
         actions, names = self.actions.finish(step)
-        own = {what: column.finish(plan) for what, column in self.of_plans.items()}
-        group, group_names = own["group"]
+        group, group_names = self.group.finish(plan)
         context, context_names, per_step = self.contexts.finish(lengths, plan, step)
         plans = assembled(
             str(self.path),
@@ -251,21 +208,7 @@ class _Rows:
             group_names,
             self.end,
         )
-        more: dict[str, Any] = {"plan_names": self.plan_names or None}
-        if self.durations is not None:
-            more["durations"] = torch.from_numpy(padded(np.array(self.durations), lengths, str(self.path)))
-        condition, condition_names = own["condition"]
-        if len(condition):
-            more |= {"condition": torch.from_numpy(condition.astype(np.int64)), "condition_names": condition_names}
-        try:
-            plans = replace(plans, **more)
-        except ValueError as error:
-            raise ValueError(f"{self.path}: {error}") from None
-        notes = feature_notes(None if context is None else torch.from_numpy(context), plans.max_length)
-        if self.unused:
-            notes.append(f"keys that are not used: {listed(sorted(self.unused))}")
-        if notes:
-            plans = replace(plans, notes=(*plans.notes, *notes))
+        warn_of_unused(self.path, "keys", sorted(self.unused))
         return renamed(plans, self.given_names, str(self.path))
 
 

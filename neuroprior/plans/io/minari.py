@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from neuroprior.plans.io.trajectories import from_trajectories, to_trajectories
-from neuroprior.plans.plans import Plans, check_are_plans
+from neuroprior.plans.plans import Plans, check_are_plans, check_plain_plans
 
 OURS = "neuroprior"
 """Key of a dataset's metadata under which stands what Minari has no place for."""
@@ -83,21 +83,20 @@ def write_minari(plans: Plans, dataset_id: str) -> None:
     episodes ("group").
 
     Args:
-        plans: at least one, each with at least one action. Their own names are not written.
+        plans: at least one, each with at least one action.
         dataset_id: such as "mice/open-field-v0", not there yet.
 
     Raises:
         ImportError: Minari is not installed.
-        ValueError: plans of vectors; no plans, or one without actions; durations, conditions or patterns, which Minari
-            cannot hold; or a dataset of this name is there already.
+        ValueError: plans of vectors; no plans, or one without actions; patterns, or fields of a subclass of `Plans`,
+            which Minari cannot hold; or a dataset of this name is there already.
     """
     check_are_plans(plans)
     minari = _module("minari")
     lengths = plans.mask().sum(1).tolist()
     if not lengths or min(lengths) == 0:
         raise ValueError(f"{dataset_id}: Minari cannot hold {'a plan without actions' if lengths else 'no plans'}")
-    if plans.durations is not None or plans.condition is not None:
-        raise ValueError(f"{dataset_id}: Minari cannot hold durations or conditions; write .npz or .jsonl")
+    check_plain_plans(plans, dataset_id)
     context, space = _context_of_steps(plans)
     shown = Plans(plans.actions, plans.num_actions, plans.lengths, context=context)
     buffers = [

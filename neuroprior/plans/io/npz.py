@@ -1,10 +1,10 @@
-"""Plans in NumPy's `.npz`: the arrays of `Plans` by their names; nothing is pickled."""
+"""Plans in NumPy's `.npz`: the fields of `Plans`, or of a subclass, by their names; nothing is pickled."""
 
 import zipfile
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -12,27 +12,25 @@ from numpy.typing import NDArray
 
 from neuroprior._checks import check_single_precision
 from neuroprior._files import written_whole
-from neuroprior.plans.columns import Names, check_file, feature_notes, listed, never_notes
+from neuroprior.plans.columns import Names, check_file, warn_of_unused
 from neuroprior.plans.io.assembly import renamed
-from neuroprior.plans.plans import Plans
+from neuroprior.plans.plans import AnyPlans, Plans
 from neuroprior.plans.sequences import constant_context
 
-NUMBERS = ("actions", "lengths", "context", "group", "durations", "condition")
-NAMES = ("action_names", "context_names", "group_names", "condition_names", "plan_names")
 
-
-def read_npz(path: Path, num_actions: int | None, action_names: Names | None) -> Plans:
-    """Plans of a `.npz` file: see `read_plans`."""
-    arrays, unused = arrays_of(path, (*NUMBERS, *NAMES, "num_actions", "end"))
-    for key in ("group", "condition"):
-        if key in arrays and arrays[key].dtype.kind == "U" and f"{key}_names" not in arrays:
-            texts = np.char.strip(arrays[key])
-            if (texts == "").any():
+def read_npz(path: Path, num_actions: int | None, action_names: Names | None, kind: type[AnyPlans]) -> AnyPlans:
+    """Plans of a `.npz` file, of the class `kind`: see `read_plans`."""
+    numbered, counts, texts = _fields(kind)
+    arrays, unused = arrays_of(path, (*numbered, *counts, *texts))
+    for key in kind.PER_PLAN:
+        if f"{key}_names" in texts and f"{key}_names" not in arrays and _holds_texts(arrays.get(key)):
+            names_of_plans = np.char.strip(arrays[key])
+            if (names_of_plans == "").any():
                 raise ValueError(f"{path}: {key}: an empty text; a name for every plan is expected")
-            arrays[f"{key}_names"], arrays[key] = np.unique(texts, return_inverse=True)
-    for key in NUMBERS:
+            arrays[f"{key}_names"], arrays[key] = np.unique(names_of_plans, return_inverse=True)
+    for key in numbered:
         if key in arrays and arrays[key].dtype.kind not in "iuf":
-            what = "numbers, or of texts without names," if key in ("group", "condition") else "numbers"
+            what = "numbers, or of texts without names," if f"{key}_names" in texts else "numbers"
             raise ValueError(f"{path}: {key}: an array of {what} is expected, not of {arrays[key].dtype}")
     if "actions" not in arrays:
         raise ValueError(f"{path}: no array 'actions'; it has {', '.join(sorted([*arrays, *unused])) or 'none'}")
@@ -41,44 +39,51 @@ def read_npz(path: Path, num_actions: int | None, action_names: Names | None) ->
             f"{path}: actions {list(arrays['actions'].shape)} are vectors: in Python"
             " neuroprior.control.read_vector_plans reads them; programs take numbered actions"
         )
-    numbers: dict[str, Any] = {key: torch.from_numpy(native(arrays[key])) for key in NUMBERS if key in arrays}
-    names: dict[str, Any] = {key: names_of(path, key, arrays[key]) for key in NAMES if key in arrays}
-    end = _whole(path, "end", arrays)
-    known = num_actions or _whole(path, "num_actions", arrays)
+    numbers: dict[str, Any] = {key: torch.from_numpy(native(arrays[key])) for key in numbered if key in arrays}
+    names: dict[str, Any] = {key: names_of(path, key, arrays[key]) for key in texts if key in arrays}
+    whole: dict[str, Any] = {key: _whole(path, key, arrays[key]) for key in counts if key in arrays}
+    known = num_actions or whole.get("num_actions")
     if known is None and "action_names" in names:
         known = len(names["action_names"])
     try:
-        guessed = known is None and action_names is None
         if known is None:
             known = _largest(numbers) + 1 if action_names is None else len(action_names)
-        plans = Plans(num_actions=known, end=end, **numbers, **names)
+        plans = kind(**whole | {"num_actions": known}, **numbers, **names)
         if plans.context is not None and plans.context.is_floating_point():
             check_single_precision("context", plans.context[plans.mask()])
-        notes = list(never_notes(plans.actions[plans.mask()].numpy(), known) if guessed else [])
-        notes += feature_notes(numbers.get("context"), plans.max_length)
-        if unused:
-            notes.append(f"arrays that are not used: {listed(unused)}")
-        plans = replace(plans, notes=tuple(notes))
-        return renamed(plans, action_names, str(path))
+        plans = renamed(plans, action_names, str(path))
     except (ValueError, TypeError, RuntimeError) as error:
         reason = str(error).removeprefix(f"{path}: ")
         raise ValueError(f"{path}: {reason.splitlines()[0]}") from error
+    warn_of_unused(path, "arrays", unused)
+    return plans
 
 
 def write_npz(plans: Plans, path: Path) -> None:
-    """Write a `.npz` file, not compressed."""
-    tensors = {key: getattr(plans, key) for key in NUMBERS}
+    """Write a `.npz` file, not compressed, with all fields of the class of the plans."""
     once = constant_context(plans)  # a context that never changes is written once a plan
-    tensors["context"] = plans.context if once is None else once
-    arrays = {key: as_array(value) for key, value in tensors.items() if value is not None}
-    for key in NAMES:
-        if getattr(plans, key) is not None:
-            arrays[key] = np.array(getattr(plans, key), str)
-    for key in ("num_actions", "end"):
-        if getattr(plans, key) is not None:
-            arrays[key] = np.array(getattr(plans, key))
+    values = vars(plans) | {"context": plans.context if once is None else once}
+    arrays = {}
+    for key, value in values.items():
+        if isinstance(value, torch.Tensor):
+            arrays[key] = as_array(value)
+        elif value is not None:
+            arrays[key] = np.array(value, None if isinstance(value, int) else str)
     with written_whole(path, "wb") as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]
+
+
+def _fields(kind: type[Plans]) -> tuple[list[str], list[str], list[str]]:
+    """The names of the fields that are tensors, integers and texts."""
+    found: dict[Any, list[str]] = {torch.Tensor: [], int: [], str: []}
+    for field in fields(kind):
+        holds = (field.type, *get_args(field.type))
+        found[next((one for one in (torch.Tensor, int) if one in holds), str)].append(field.name)
+    return found[torch.Tensor], found[int], found[str]
+
+
+def _holds_texts(array: NDArray[Any] | None) -> bool:
+    return array is not None and array.dtype.kind == "U"
 
 
 def arrays_of(path: Path, keys: Sequence[str]) -> tuple[dict[str, NDArray[Any]], list[str]]:
@@ -116,10 +121,7 @@ def names_of(path: Path, key: str, array: NDArray[Any]) -> Names:
     return tuple(str(name) for name in array)
 
 
-def _whole(path: Path, key: str, arrays: dict[str, NDArray[Any]]) -> int | None:
-    if key not in arrays:
-        return None
-    array = arrays[key]
+def _whole(path: Path, key: str, array: NDArray[Any]) -> int:
     if array.size != 1 or array.dtype.kind not in "iu":
         raise ValueError(f"{path}: {key}: one integer is expected, not {array.dtype} of shape {list(array.shape)}")
     return int(array.item())

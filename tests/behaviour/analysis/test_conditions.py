@@ -14,6 +14,7 @@ from torch import Tensor
 from neuroprior import Plans
 from neuroprior.behaviour import PermutationDesign, compare_conditions, holm
 from neuroprior.behaviour.analysis.condition_chains import SMOOTHING
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from tests.support.sources import refuses, seeded
 from tests.support.studies import between, study, within
 
@@ -218,7 +219,9 @@ def test_estimates_are_weighted_means_over_animals_with_students_intervals():
     actions = torch.zeros(6, 60, dtype=torch.long)
     for row, number in enumerate(ones):
         actions[row, :number] = 1
-    plans = Plans(actions, 2, torch.tensor(lengths), group=torch.arange(6), condition=torch.tensor([0, 0, 0, 1, 1, 1]))
+    plans = RecordedPlans(
+        actions, 2, torch.tensor(lengths), group=torch.arange(6), condition=torch.tensor([0, 0, 0, 1, 1, 1])
+    )
     family = family_of(compare_conditions(plans), "actions")
     share, n = np.array(ones) / lengths, np.array(lengths)
     weight = n / (n + SMOOTHING)
@@ -256,7 +259,7 @@ def test_features_are_shares_and_mean_log_durations_by_hand():
     durations = torch.ones(4, 5)
     durations[0] = torch.tensor([4.0, 9.0, 0.0, float("nan"), 1.0])
     durations[1, 0] = 2.0
-    plans = Plans(
+    plans = RecordedPlans(
         actions, 3, group=torch.tensor([0, 0, 1, 2]), condition=torch.tensor([0, 0, 1, 1]), durations=durations
     )
     plans = plans[torch.tensor([0, 1, 2, 2, 3, 3])]
@@ -362,7 +365,7 @@ def test_all_labellings_are_distinct_and_the_observed_one_is_first():
     for sizes in ([3, 4], [2, 2, 3], [2, 2, 2, 2]):
         label = torch.tensor([k for k, size in enumerate(sizes) for _ in range(size)])
         label = label[torch.randperm(len(label), generator=seeded(0))]
-        plans = Plans(torch.zeros(len(label), 1, dtype=torch.long), 2, condition=label)
+        plans = RecordedPlans(torch.zeros(len(label), 1, dtype=torch.long), 2, condition=label)
         design = PermutationDesign.of(plans)
         found = [tuple(own) for own in design.labellings(design.possible - 1).T.tolist()]
         assert found[0] == tuple(label.tolist())
@@ -507,7 +510,7 @@ def test_plans_without_actions_and_actions_that_an_animal_never_takes():
 
 def test_what_never_varies_does_not_differ():
     """A single action has the same share everywhere, and its p-value is 1."""
-    plans = Plans(torch.zeros(8, 9, dtype=torch.long), 1, group=torch.arange(8), condition=torch.arange(8) % 2)
+    plans = RecordedPlans(torch.zeros(8, 9, dtype=torch.long), 1, group=torch.arange(8), condition=torch.arange(8) % 2)
     found = compare_conditions(plans)
     assert [p for p, _ in found.tests.values()] == [1.0] * len(found.tests)
     assert found.prediction.accuracy == 0.5
@@ -518,7 +521,7 @@ def test_conditions_with_the_same_mean_do_not_differ(order):
     """Animals of both conditions take action 0 equally often: whatever rounding leaves of the difference is a tie."""
     often = [3, 7, 12, 18]
     rows = [[0] * k + [1] * (20 - k) for k in [*often, *(often[place] for place in order)]]
-    plans = Plans(torch.tensor(rows), 2, group=torch.arange(8), condition=torch.arange(8) // 4)
+    plans = RecordedPlans(torch.tensor(rows), 2, group=torch.arange(8), condition=torch.arange(8) // 4)
     assert family_of(compare_conditions(plans), "actions").p_values.tolist() == [1, 1]
 
 

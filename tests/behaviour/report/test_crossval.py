@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from neuroprior.behaviour.analysis.comparison import DEPTH, score_bits, units
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.report import fits
 from neuroprior.behaviour.report.fits import (
     ACTIONS,
@@ -32,8 +33,8 @@ from tests.support.sources import refuses, seeded
 STEPS = 3  # of neural priors, where they do not matter
 
 
-def chain(num: int = 24, length: int = 7, seed: int = 0, **more) -> Plans:
-    plans = markov_plans(markov_probs(3, 1, 0, 1.5), num, length, seed)
+def chain(num: int = 24, length: int = 7, seed: int = 0, **more) -> RecordedPlans:
+    plans = RecordedPlans.of(markov_plans(markov_probs(3, 1, 0, 1.5), num, length, seed))
     lengths = torch.randint(2, length + 1, (num,), generator=seeded(seed + 1))
     return replace(plans, lengths=lengths, **more)
 
@@ -176,7 +177,7 @@ def test_durations_of_other_held_out_plans_do_not_matter():
     times = torch.rand(32, 7, generator=seeded(3)) + 0.5
     plans = chain(durations=times[:24])
     design, job = Design(1, max_steps=1), Job(0, "gru", DURATIONS)
-    test = Plans(plans.actions[:8], 3, plans.lengths[:8], durations=times[24:])
+    test = RecordedPlans(plans.actions[:8], 3, plans.lengths[:8], durations=times[24:])
     other = replace(test, durations=times[24:] * torch.tensor([1.0] * 3 + [100.0] * 5)[:, None])
     bits, again = (fit_and_score(plans, some, design, job)["gru/bits"] for some in (test, other))
     assert again[:3] == pytest.approx(bits[:3], abs=1e-6)

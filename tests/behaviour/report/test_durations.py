@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from neuroprior.behaviour.analysis.comparison import score_bits
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.report.document import Document
 from neuroprior.behaviour.report.durations import chain_bits
 from neuroprior.behaviour.report.figures import MOST_PANELS, dwell_figure
@@ -32,7 +33,9 @@ def timed(telling: bool, num_plans: int = 24, length: int = 60, seed: int = 0, n
         long = durations[:, t - 1] > 2 * 0.6931
         actions[:, t] = torch.where(long & telling, 0, actions[:, t])
     names = tuple("abcdefghijklmnop")[:num_actions]
-    return Plans(actions, num_actions, durations=durations, group=torch.arange(num_plans) % 8, action_names=names)
+    return RecordedPlans(
+        actions, num_actions, durations=durations, group=torch.arange(num_plans) % 8, action_names=names
+    )
 
 
 def tables(plans: Plans) -> dict[str, pd.DataFrame]:
@@ -51,8 +54,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Document, Path]:
     durations = plans.durations.clone()
     durations[:, ::10] = nan
     durations[plans.actions == 2] = 0
-    write_plans(replace(plans, durations=durations), folder / "plans.csv")
-    return report(folder / "plans.csv", out=folder, **ONLY), folder
+    write_plans(replace(plans, durations=durations), folder / "plans.npz")
+    return report(folder / "plans.npz", out=folder, **ONLY), folder
 
 
 def test_the_section_of_a_file(made):

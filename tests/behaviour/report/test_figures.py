@@ -6,7 +6,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 
-from neuroprior import Plans
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.report.drawing import FEWER, KINDS, MARKOV, MORE, SPARE, STRIPS, colors, lines
 from neuroprior.behaviour.report.figures import (
     condition_figure,
@@ -89,7 +89,7 @@ def test_drift_stands_at_the_middles_of_parts_and_at_the_numbers_of_plans():
 def test_plans_stand_in_their_own_order_and_not_by_name():
     """One action a plan, so that each row has one colour; parts of a plan are in one row."""
     actions = torch.tensor([[0, 0], [1, 1], [2, 2], [1, 1]])
-    plans = Plans(actions, 3, plan_names=("c", "a", "b", "a"), group=torch.zeros(4, dtype=torch.long))
+    plans = RecordedPlans(actions, 3, recording=("c", "a", "b", "a"), group=torch.zeros(4, dtype=torch.long))
     for some, want in (([0, 1, 2], [0, 1, 2]), ([1, 2, 0], [1, 2, 0]), ([0, 1, 3, 2], [0, 1, 2])):
         (axes,) = ethogram_figure(plans[torch.tensor(some)]).axes
         column = axes.images[0].get_array()[:, 0]

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from neuroprior import Plans
-from neuroprior.behaviour import choose_modes, mode_table, motifs
+from neuroprior.behaviour import RecordedPlans, choose_modes, mode_table, motifs
 from neuroprior.behaviour.report.figures import group_transition_figure
 from neuroprior.behaviour.report.fits import counted
 from neuroprior.behaviour.report.modes import MOST_MOTIFS, mode_section
@@ -50,7 +50,7 @@ def plans() -> Plans:
 
 @pytest.fixture(scope="module")
 def part(plans) -> Part:
-    found = evaluate_saved({"uniform": UniformPrior(5)}, plans, SKIP)
+    found = evaluate_saved({"uniform": UniformPrior(5)}, RecordedPlans.of(plans), SKIP)
     made = mode_section(replace(found, settings=found.settings | {"modes": [1, 2]}))
     assert made is not None
     return made

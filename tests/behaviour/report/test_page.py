@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.report.drawing import FEWER, KINDS, MARKOV, MORE, SPARE, STRIPS, drawn, short
 from neuroprior.behaviour.report.figures import (
     MOST_BINS,
@@ -342,7 +343,7 @@ def sessions(names: list[str], num: int = 6, length: int = 20, **more) -> Plans:
     actions = torch.randint(len(names), (num, length), generator=generator)
     group, called = torch.arange(num) // 2, [f"{names[0]} {i}" for i in range(num // 2)]
     own = {"group": group, "group_names": called, "condition": group % 2, "condition_names": ["x", names[-1]]}
-    return Plans(actions, len(names), torch.arange(num) % 3 + length - 2, names, **own | more)
+    return RecordedPlans(actions, len(names), torch.arange(num) % 3 + length - 2, names, **own | more)
 
 
 def strips(figure: Figure) -> tuple[np.ndarray, list[int]]:
@@ -373,12 +374,12 @@ def test_an_ethogram_has_the_actions_in_their_colours_by_condition_and_group():
 def test_parts_of_a_plan_are_in_one_row_of_an_ethogram():
     """In their order, with a blank between them; plans of one name in two groups are two."""
     actions, group = torch.tensor([[0, 1], [1, 0], [0, 0], [1, 1]]), torch.tensor([0, 1, 0, 0])
-    plans = Plans(actions, 2, torch.tensor([2, 2, 1, 2]), group=group, plan_names=["x", "x", "x", "y"])
+    plans = RecordedPlans(actions, 2, torch.tensor([2, 2, 1, 2]), group=group, recording=["x", "x", "x", "y"])
     rows, _ = strips(ethogram_figure(plans))
     due = [[0, 1, None, 0], [1, 1, None, None], [1, 0, None, None]]
     shown = [[to_hex(color[:3]) if color[3] else None for color in row] for row in rows]
     assert shown == [[None if action is None else STRIPS[action] for action in row] for row in due]
-    timed = Plans(actions, 2, plans.lengths, group=group, plan_names=plans.plan_names, durations=2.0 + actions)
+    timed = RecordedPlans(actions, 2, plans.lengths, group=group, recording=plans.recording, durations=2.0 + actions)
     (first, *_), _ = strips(ethogram_figure(timed))  # 2, 3, a blank of 3 (the median), 2
     at = (np.arange(MOST_BINS) + 0.5) * 10 / MOST_BINS
     for low, high, action in ((0, 2, 0), (2, 5, 1), (5, 8, None), (8, 10, 0)):
@@ -390,7 +391,7 @@ def test_parts_of_a_plan_are_in_one_row_of_an_ethogram():
 def test_an_ethogram_of_durations_is_in_time():
     """Of durations 1, 3, unknown and 4, the third is blank for the median of the known ones, 3."""
     times = torch.tensor([[1.0, 3.0, float("nan"), 4.0]])
-    plans = Plans(torch.tensor([[0, 1, 0, 2]]), 3, action_names=("a", "b", "c"), durations=times)
+    plans = RecordedPlans(torch.tensor([[0, 1, 0, 2]]), 3, action_names=("a", "b", "c"), durations=times)
     (row,), _ = strips(ethogram_figure(plans))
     assert len(row) == MOST_BINS
     at = (np.arange(MOST_BINS) + 0.5) * 11 / MOST_BINS

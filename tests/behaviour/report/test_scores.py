@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 import torch
 
+from neuroprior.behaviour import PastDurations, RecordedPlans
 from neuroprior.behaviour.analysis.comparison import action_bits, score_bits
 from neuroprior.behaviour.report.fits import ACTIONS, CONTEXT, DURATIONS, Design, Job
 from neuroprior.behaviour.report.scores import (
@@ -18,13 +19,13 @@ from neuroprior.behaviour.report.scores import (
     load_arrays,
     save_arrays,
 )
-from neuroprior.plans import PastDurations, Plans
+from neuroprior.plans import Plans
 from neuroprior.plans.folds import folds
 from neuroprior.plans.sequences import plans_digest
 from neuroprior.priors import GRUPrior, MarkovPrior, UniformPrior
 from tests.support.sources import refuses, seeded
 
-PLANS = Plans(torch.randint(3, (6, 4), generator=seeded(0)), 3)
+PLANS = RecordedPlans(torch.randint(3, (6, 4), generator=seeded(0)), 3)
 MASK = PLANS.mask()
 
 
@@ -142,9 +143,10 @@ def test_saved_priors_are_compared_with_the_first():
 def test_a_saved_prior_of_durations_says_so():
     plans = replace(PLANS, durations=torch.rand(6, 4, generator=seeded(1)) + 0.5)
     prior = GRUPrior(3, context_size=2, hidden_size=4)
-    prior.past_durations = PastDurations.of(plans)
-    (one,) = evaluate_saved({"it": prior}, plans, 0).models
+    past = PastDurations.of(plans)
+    (one,) = evaluate_saved({"it": prior}, plans, 0, past_durations={"it": past}).models
     assert one.label == "it, with durations"
+    assert one.bits.equal(action_bits(prior, past.added_to(plans)))
 
 
 def test_a_digest_is_of_all_that_plans_hold():
@@ -156,8 +158,6 @@ def test_a_digest_is_of_all_that_plans_hold():
     digests = [plans_digest(plans) for plans in changed]
     assert len(set(digests)) == len(digests)
     assert plans_digest(replace(PLANS)) == digests[0]
-    # A run that is resumed reads its plans from a file, which has no notes of the first reader.
-    assert plans_digest(replace(PLANS, notes=("2 rows have no label",))) == digests[0]
 
 
 def test_results_are_written_and_read(tmp_path):

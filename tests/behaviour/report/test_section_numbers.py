@@ -20,6 +20,7 @@ from neuroprior.behaviour import (
     motifs,
     mutual_information,
 )
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.report.conditions import condition_section
 from neuroprior.behaviour.report.fits import ACTIONS, CONTEXT
 from neuroprior.behaviour.report.scores import Evaluation, evaluate_saved
@@ -49,7 +50,7 @@ def plans() -> Plans:
     actions = torch.where(context[:, None] == 0, parts[0], parts[1])
     durations = torch.rand(12, 20, generator=seeded(3)) ** 3 * 10
     named = {"action_names": NAMES, "group_names": ("ada", "ben", "cleo", "dora", "eve")}
-    return Plans(actions, 3, LENGTHS, context=context, group=GROUP, durations=durations, **named)
+    return RecordedPlans(actions, 3, LENGTHS, context=context, group=GROUP, durations=durations, **named)
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +109,7 @@ def test_all_plans_are_described_whichever_were_scored(section, plans, found):
     ],
 )
 def test_what_the_context_is(context, words):
-    plans = Plans(torch.tensor([[0, 1], [2, 1]]), 3, context=context, condition=torch.tensor([0, 1]))
+    plans = RecordedPlans(torch.tensor([[0, 1], [2, 1]]), 3, context=context, condition=torch.tensor([0, 1]))
     assert cells(file_section(evaluate_saved({"uniform": UniformPrior(3)}, plans, 0)))[0][5:] == ["0", words, "2"]
 
 
@@ -138,7 +139,7 @@ def test_mutual_information_is_that_after_what_does_not_count(plans, skip):
 
 
 def test_where_no_pair_of_actions_counts_there_is_no_section():
-    plans = markov_plans(markov_probs(3, 1, 0), 8, 6, 1)
+    plans = RecordedPlans.of(markov_plans(markov_probs(3, 1, 0), 8, 6, 1))
     assert lag_section(evaluate_saved({"uniform": UniformPrior(3)}, replace(plans, group=None), 5)) is not None
     evaluation = replace(evaluate_saved({"uniform": UniformPrior(3)}, plans, 0), settings={"skip": 6})
     assert lag_section(evaluation) is None
@@ -167,7 +168,7 @@ def worded() -> Plans:
     plans = words[torch.randint(3, (34, 4), generator=seeded(0))].flatten(1)
     wild = torch.rand(plans.shape, generator=seeded(1)) < 0.25
     actions = torch.where(wild, torch.randint(4, plans.shape, generator=seeded(2)), plans)
-    return Plans(actions, 4, action_names=list("abcd"), group=torch.arange(34) % 6)
+    return RecordedPlans(actions, 4, action_names=list("abcd"), group=torch.arange(34) % 6)
 
 
 def test_over_represented_sequences(worded):
@@ -208,7 +209,7 @@ def test_the_beginnings_of_plans_are_no_drift(length, words):
     """Actions repeat at probability .9 throughout; only the first, which nothing stands before, costs more."""
     repeats = torch.rand(200, length, generator=seeded(0)) < 0.9
     repeats[:, 0] = torch.rand(200, generator=seeded(1)) < 0.5
-    plans = Plans((~repeats).long().cumsum(1) % 2, 2)
+    plans = RecordedPlans((~repeats).long().cumsum(1) % 2, 2)
     part = drift_section(evaluate_saved({"chain": MarkovPrior(2, 1).fit(plans)}, plans, 0))
     change = part.frames["drift_tests"].set_index("test").loc["change over a plan, bits"]
     assert (change["low"] < 0 < change["high"]) == (length == 20)
@@ -226,7 +227,7 @@ def test_the_action_that_changes_most_clearly_comes_first():
         rows.append(first + second)
     actions = torch.tensor(np.array(rows))
     actions[:12, 15:19] = 0
-    plans = Plans(actions, 3, action_names=NAMES)
+    plans = RecordedPlans(actions, 3, action_names=NAMES)
     part = drift_section(evaluate_saved({"uniform": UniformPrior(3)}, plans, 0))
     frame = part.frames["action_drift"].set_index("action")
     assert cells(part, len(part.section.tables) - 1)[0][0] == "dig"

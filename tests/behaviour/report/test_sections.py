@@ -9,6 +9,7 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
+from neuroprior.behaviour import RecordedPlans
 from neuroprior.behaviour.report.document import Document
 from neuroprior.behaviour.report.options import FitOptions, ReadOptions
 from neuroprior.behaviour.report.page import FigureBox
@@ -27,7 +28,7 @@ from tests.support.sources import refuses, seeded
 
 
 def found_in(plans: Plans):
-    return evaluate_saved({"uniform": UniformPrior(plans.num_actions)}, plans, 0)
+    return evaluate_saved({"uniform": UniformPrior(plans.num_actions)}, RecordedPlans.of(plans), 0)
 
 
 def test_gains_are_starred_where_their_interval_is_above_0():

@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 import torch
 
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.plans import Plans
 from tests.support.sources import seeded
 
@@ -44,9 +45,9 @@ def timed(num: int = 24, longest: int = 14, seed: int = 0, names: Sequence[str] 
     times = torch.where(actions == 1, (0.5 * normal + 0.3).exp(), -2 * uniform.log() * (1 + actions))
     times[:, :-1] *= 1 + 2 * ((actions[:, :-1] == 0) & (actions[:, 1:] == 1))
     times[0, 1], times[-1, 0] = torch.nan, 0
-    more = {"durations": times, "plan_names": [f"session {number}" for number in range(num)]}
+    more = {"durations": times, "recording": [f"session {number}" for number in range(num)]}
     condition = (plans.group % 2).long()
-    return Plans(
+    return RecordedPlans(
         plans.actions, len(names), plans.lengths, names, group=plans.group, condition=condition,
         condition_names=("control", "treated"), group_names=[f"mouse {number}" for number in range(1, 7)], **more
     )  # fmt: skip

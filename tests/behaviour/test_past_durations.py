@@ -5,13 +5,15 @@ from math import exp, log, nan
 import pytest
 import torch
 
-from neuroprior.plans import PastDurations, Plans
+from neuroprior.behaviour import PastDurations
+from neuroprior.behaviour.recorded_plans import RecordedPlans
+from neuroprior.plans import Plans
 from neuroprior.priors import GRUPrior, load, match_plans, save
 from tests.support.sources import refuses, seeded
 
 ACTIONS = torch.tensor([[0, 1, 2, 1], [1, 0, 0, 0]])
 DURATIONS = torch.tensor([[1.0, exp(2), nan, 5.0], [0.0, 3.0, 9.0, 9.0]])
-PLANS = Plans(ACTIONS, 3, torch.tensor([4, 2]), durations=DURATIONS)
+PLANS = RecordedPlans(ACTIONS, 3, torch.tensor([4, 2]), durations=DURATIONS)
 
 
 def test_the_features_of_each_step():
@@ -29,20 +31,20 @@ def test_the_features_of_each_step():
 def test_the_end_takes_no_time():
     """Whatever stands there as the duration of an end symbol is none of an action."""
     actions, times = torch.tensor([[0, 1, 2], [1, 0, 2]]), torch.tensor([[1.0, 2, 3], [4, 5, 6]])
-    ended = Plans(actions, 3, end=2, durations=times)
-    assert PastDurations.of(ended) == PastDurations.of(Plans(actions[:, :2], 3, durations=times[:, :2]))
+    ended = RecordedPlans(actions, 3, end=2, durations=times)
+    assert PastDurations.of(ended) == PastDurations.of(RecordedPlans(actions[:, :2], 3, durations=times[:, :2]))
 
 
 @pytest.mark.parametrize("number", [1, 3])
 def test_no_duration_is_known_before_its_action_is_chosen(number):
     """The context of step t is the same whatever the actions from t on take."""
     durations = torch.rand(5, 8, generator=seeded(0))
-    plans = Plans(torch.zeros(5, 8, dtype=torch.long), 2, durations=durations)
+    plans = RecordedPlans(torch.zeros(5, 8, dtype=torch.long), 2, durations=durations)
     past = PastDurations.of(plans, number)
     for step in range(8):
         other = durations.clone()
         other[:, step:] = 100 * torch.rand(5, 8 - step, generator=seeded(step))
-        changed = past.added_to(Plans(plans.actions, 2, durations=other)).context
+        changed = past.added_to(RecordedPlans(plans.actions, 2, durations=other)).context
         same = (changed == past.added_to(plans).context).all(2).all(0)
         assert same.tolist() == [t <= step for t in range(8)]
 
@@ -50,10 +52,10 @@ def test_no_duration_is_known_before_its_action_is_chosen(number):
 def test_the_constants_are_robust():
     times = torch.exp(torch.linspace(-1, 3, 401))
     times[-5:] = 1e9
-    plans = Plans(torch.zeros(1, 401, dtype=torch.long), 1, durations=times[None])
+    plans = RecordedPlans(torch.zeros(1, 401, dtype=torch.long), 1, durations=times[None])
     past = PastDurations.of(plans)
     assert (past.center, past.spread) == pytest.approx((1, 2 / 1.349), abs=1e-3)
-    constant = Plans(ACTIONS, 3, durations=torch.full((2, 4), 7.0))
+    constant = RecordedPlans(ACTIONS, 3, durations=torch.full((2, 4), 7.0))
     assert PastDurations.of(constant).spread == 1
     assert PastDurations.of(constant.with_end()) == PastDurations.of(constant)
 
@@ -68,24 +70,35 @@ def test_the_constants_by_hand():
 def test_they_stand_behind_other_features():
     past = PastDurations(1, 0.0, 1.0)
     features = torch.tensor([[5.0, 6.0], [7.0, 8.0]])
-    once = past.added_to(Plans(ACTIONS, 3, durations=DURATIONS.nan_to_num(), context=features)).context
+    once = past.added_to(RecordedPlans(ACTIONS, 3, durations=DURATIONS.nan_to_num(), context=features)).context
     assert once.shape == (2, 4, 4)
     assert once[:, :, :2].equal(features[:, None].expand(2, 4, 2))
-    each = past.added_to(Plans(ACTIONS, 3, durations=DURATIONS.nan_to_num(), context=features[:, None].repeat(1, 4, 1)))
+    each = past.added_to(
+        RecordedPlans(ACTIONS, 3, durations=DURATIONS.nan_to_num(), context=features[:, None].repeat(1, 4, 1))
+    )
     assert each.context.equal(once)
 
 
-def test_a_prior_that_was_trained_with_them_makes_them_itself(tmp_path):
-    plans = Plans(ACTIONS.repeat(20, 1), 3, durations=DURATIONS.nan_to_num(1.0).repeat(20, 1))
+def test_they_are_kept_beside_the_prior_that_was_trained_with_them(tmp_path):
+    plans = RecordedPlans(ACTIONS.repeat(20, 1), 3, durations=DURATIONS.nan_to_num(1.0).repeat(20, 1))
     past = PastDurations.of(plans.with_end())
     prior = GRUPrior(4, 8, context_size=2)
     prior.fit(past.added_to(plans.with_end()), generator=seeded(0), max_steps=2, progress=False)
-    prior.past_durations = past
     again = load(save(prior, tmp_path))
-    assert again.past_durations == past
-    assert again.log_prob(match_plans(plans, again)).equal(prior.log_prob(past.added_to(plans.with_end())))
+    assert PastDurations.load(tmp_path) is None
+    past.save(tmp_path)
+    assert PastDurations.load(tmp_path) == past
+    matched = past.added_to(match_plans(plans, again))
+    assert again.log_prob(matched).equal(prior.log_prob(past.added_to(plans.with_end())))
     with refuses("durations: these plans have none"):
-        match_plans(Plans(ACTIONS, 3), again)
+        past.added_to(match_plans(Plans(ACTIONS, 3), again))
+
+
+@pytest.mark.parametrize("content", ["{", "[1]", '{"number": 1}', '{"number": 0, "center": 0.0, "spread": 1.0}'])
+def test_a_damaged_file_is_named(content, tmp_path):
+    (tmp_path / "past_durations.json").write_text(content)
+    with refuses(f"{tmp_path / 'past_durations.json'}: damaged"):
+        PastDurations.load(tmp_path)
 
 
 def test_what_is_refused():
@@ -94,8 +107,8 @@ def test_what_is_refused():
     with refuses("durations: these plans have none"):
         PastDurations.of(Plans(ACTIONS, 3))
     with refuses("at least one above 0"):
-        PastDurations.of(Plans(ACTIONS, 3, durations=torch.zeros(2, 4)))
-    index = Plans(ACTIONS, 3, durations=DURATIONS, context=torch.tensor([0, 1]))
+        PastDurations.of(RecordedPlans(ACTIONS, 3, durations=torch.zeros(2, 4)))
+    index = RecordedPlans(ACTIONS, 3, durations=DURATIONS, context=torch.tensor([0, 1]))
     with refuses("an index cannot stand beside past durations"):
         PastDurations(1, 0.0, 1.0).added_to(index)
     with refuses("`center` must be between", "`spread` above 0"):

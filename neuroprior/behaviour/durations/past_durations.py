@@ -1,11 +1,17 @@
 """How long the last actions took, as a context of the next action."""
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 
 import torch
 
 from neuroprior._checks import check_sizes
-from neuroprior.plans.plans import Plans, durations_of
+from neuroprior._files import read_json, write_json
+from neuroprior.behaviour.recorded_plans import durations_of
+from neuroprior.plans.plans import AnyPlans, Plans
+
+FILE = "past_durations.json"
+"""In the folder of a prior that was trained with these features."""
 
 QUARTILES = 1.349
 """Standard deviations between the quartiles of a normal distribution."""
@@ -66,8 +72,29 @@ class PastDurations:
         low, middle, high = (float(logs[round(share * (len(logs) - 1))]) for share in (0.25, 0.5, 0.75))
         return cls(number, middle, (high - low) / QUARTILES or 1.0)
 
-    def added_to(self, plans: Plans) -> Plans:
+    @classmethod
+    def load(cls, folder: Path) -> "PastDurations | None":
+        """What `save` wrote beside a prior; None where nothing was.
+
+        Raises:
+            ValueError: the file is damaged.
+        """
+        place = folder / FILE
+        if not place.is_file():
+            return None
+        try:
+            return cls(**read_json(place))
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{place}: damaged ({str(error).removeprefix(f'{place}: ')})") from error
+
+    def save(self, folder: Path) -> None:
+        """Write it to the folder of the prior that was trained with these features."""
+        write_json(folder / FILE, asdict(self))
+
+    def added_to(self, plans: AnyPlans) -> AnyPlans:
         """The plans with these features as their context, behind the features that they have already.
+
+        For a prior with an end symbol, plans have it before the features are added.
 
         Args:
             plans: N plans with durations; without a context, or with features.

@@ -1,0 +1,173 @@
+"""Plans that are parts of recordings: times, conditions and names stay with their plans, in memory and in files."""
+
+import math
+
+import pytest
+import torch
+
+from neuroprior import Plans
+from neuroprior.behaviour import RecordedPlans
+from neuroprior.behaviour.recorded_plans import durations_of
+from neuroprior.behaviour.report import ReadOptions
+from neuroprior.plans import in_parts, read_plans, write_minari, write_plans
+from neuroprior.plans.sequences import plans_digest
+from tests.support.sources import refuses
+
+NAN = math.nan
+FIELDS = {
+    "recording": ("s1", "s1", "s2"),
+    "began": torch.tensor([[0.0, 2.5, 4.0], [9.5, NAN, 0.0], [1e9 + 0.125, 0.0, 0.0]], dtype=torch.float64),
+    "durations": torch.tensor([[2.5, 1.5, NAN], [0.0, 3.0, 0.0], [7.0, 0.0, 0.0]]),
+    "condition": torch.tensor([1, 1, 0]),
+    "condition_names": ("drug", "saline"),
+    "notes": ("2 rows have no label",),
+}
+PLANS = RecordedPlans(
+    torch.tensor([[0, 1, 2], [2, 1, 0], [1, 0, 0]]), 3, torch.tensor([3, 2, 1]), group=torch.tensor([4, 4, 7]), **FIELDS
+)
+
+
+def told(values):
+    """Numbers in lists, None for those that are not known."""
+    return [[None if math.isnan(one) else one for one in row] for row in values.tolist()]
+
+
+def test_times_are_stored_where_there_are_actions():
+    assert (PLANS.began.dtype, PLANS.durations.dtype) == (torch.float64, torch.float32)
+    assert told(PLANS.began) == [[0, 2.5, 4], [9.5, None, 0], [1e9 + 0.125, 0, 0]]
+    assert told(PLANS.durations) == [[2.5, 1.5, None], [0, 3, 0], [7, 0, 0]]
+    shown = RecordedPlans(PLANS.actions, 3, PLANS.lengths, began=torch.ones(3, 3), durations=torch.ones(3, 3))
+    assert shown.began.tolist() == shown.durations.tolist() == [[1, 1, 1], [1, 1, 0], [1, 0, 0]]
+
+
+@pytest.mark.parametrize("index", [slice(1, 3), torch.tensor([2, 0]), torch.tensor([True, False, True])])
+def test_indexing_takes_everything_along(index):
+    rows = torch.arange(3)[index].tolist()
+    some = PLANS[index]
+    assert isinstance(some, RecordedPlans)
+    assert some.recording == tuple(FIELDS["recording"][row] for row in rows)
+    assert told(some.began) == [told(PLANS.began)[row] for row in rows]
+    assert told(some.durations) == [told(PLANS.durations)[row] for row in rows]
+    assert some.condition.tolist() == [FIELDS["condition"].tolist()[row] for row in rows]
+    assert (some.condition_names, some.notes) == (FIELDS["condition_names"], FIELDS["notes"])
+
+
+def test_steps_and_parts_have_the_times_of_their_actions():
+    cut = PLANS.steps(1, 3)
+    assert told(cut.began) == [[2.5, 4], [None, 0], [0, 0]]
+    assert told(cut.durations) == [[1.5, None], [3, 0], [0, 0]]
+    parts = in_parts(PLANS[:1], 2)
+    assert told(parts.began) == [[0, 2.5], [4, 0]]
+    assert parts.recording == ("s1", "s1")
+    assert parts.condition.tolist() == [1, 1]
+
+
+def test_an_end_symbol_takes_no_time_and_comes_off_again():
+    closed = PLANS.with_end()
+    assert told(closed.durations) == [[2.5, 1.5, None, 0], [0, 3, 0, 0], [7, 0, 0, 0]]
+    assert told(closed.began) == [[0, 2.5, 4, None], [9.5, None, None, 0], [1e9 + 0.125, None, 0, 0]]
+    opened = closed.without_end()
+    assert told(opened.durations) == told(PLANS.durations)
+    assert told(opened.began) == told(PLANS.began)
+    assert opened.recording == PLANS.recording
+
+
+def test_plain_plans_are_recorded_plans_without_times():
+    plain = Plans(PLANS.actions, 3, PLANS.lengths, ("a", "b", "c"), torch.tensor([5, 6, 7]))
+    recorded = RecordedPlans.of(plain)
+    assert recorded.action_names == plain.action_names
+    assert all(getattr(recorded, name).equal(getattr(plain, name)) for name in ("actions", "lengths", "context"))
+    assert all(getattr(recorded, name) in (None, ()) for name in FIELDS)
+    assert RecordedPlans.of(PLANS) is PLANS
+    for plans in (plain, recorded):
+        with refuses("durations: these plans have none; give RecordedPlans(durations=)"):
+            durations_of(plans)
+
+
+def test_npz_files_hold_everything_and_others_refuse_it(tmp_path):
+    write_plans(PLANS, tmp_path / "a.npz")
+    back = ReadOptions().read(str(tmp_path / "a.npz"))
+    for name in ("actions", "lengths", "group", "condition"):
+        assert getattr(back, name).equal(getattr(PLANS, name)), name
+    for name in ("began", "durations"):
+        assert getattr(back, name).dtype == getattr(PLANS, name).dtype
+        assert told(getattr(back, name)) == told(getattr(PLANS, name))
+    assert (back.recording, back.condition_names, back.notes) == (
+        PLANS.recording,
+        PLANS.condition_names,
+        PLANS.notes,
+    )
+    assert plans_digest(back) == plans_digest(PLANS)
+    with pytest.warns(UserWarning, match="arrays that are not used: recording, began, durations, condition, condition"):
+        assert type(read_plans(tmp_path / "a.npz")) is Plans
+    for name in ("a.jsonl", "a.csv"):
+        with refuses(name, "recording, condition, began, durations of RecordedPlans are written to .npz files only"):
+            write_plans(PLANS, tmp_path / name)
+    with refuses("mice/a-v0: recording, condition, began, durations of RecordedPlans"):
+        write_minari(PLANS, "mice/a-v0")
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"began": torch.full((3, 3), math.inf)}, "`began[0, 0]` must be finite times, got inf"),
+        ({"began": torch.ones(3)}, "`began` must have shape [3, 3], got [3]"),
+        ({"condition": torch.tensor([0, 1])}, "`condition` must have shape [3], got [2]"),
+        ({"condition_names": ("a",)}, "`condition_names` must come with the integers in condition"),
+        ({"condition": torch.tensor([0, 2, 0]), "condition_names": ("a", "b")}, "condition[1]: 2"),
+        ({"notes": "x"}, "`notes` must be a list of texts"),
+    ],
+)
+def test_what_is_refused(fields, words):
+    with refuses(words):
+        RecordedPlans(PLANS.actions, 3, **fields)
+
+
+@pytest.mark.parametrize("wrong", [-0.5, math.inf, -math.inf])
+def test_durations_are_times_where_there_are_actions(wrong):
+    """Those that are not known are NaN; whatever stands beyond the ends of plans is 0."""
+    durations, lengths = torch.tensor([[1.5, 0.0, wrong], [math.nan, 2.0, wrong]]), torch.tensor([2, 2])
+    actions = torch.zeros(2, 3, dtype=torch.long)
+    kept = RecordedPlans(actions, 1, lengths, durations=durations).durations
+    assert kept.nan_to_num(-1).tolist() == [[1.5, 0, 0], [-1, 2, 0]]
+    with refuses(f"`durations[1, 2]` must be finite times from 0, got {wrong}"):
+        RecordedPlans(actions, 1, torch.tensor([2, 3]), durations=durations)
+
+
+def test_plans_keep_their_names():
+    plans = RecordedPlans(torch.arange(6).view(3, 2), 6, recording=["a", "b", "a"])
+    assert plans.recording == ("a", "b", "a")
+    assert plans[1:].recording == ("b", "a")
+    assert plans[torch.tensor([2, 1])].recording == ("a", "b")
+    assert plans[torch.tensor([True, False, True])].recording == ("a", "a")
+    assert plans.with_end().recording == plans.steps(1).recording == plans.recording
+    for part in plans.split(0.4, torch.Generator().manual_seed(0)):
+        assert [("a", "b", "a")[int(first) // 2] for first in part.actions[:, 0]] == list(part.recording)
+    for wrong, words in (
+        (["a", "b"], "`recording` must be 3 names, one a plan, got 2"),
+        ("abc", "`recording` must be a list of texts"),
+        (["a", "b", "\ud83d"], ".*surrogate"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            RecordedPlans(plans.actions, 6, recording=wrong)
+
+
+def test_durations_and_conditions_stay_with_their_plans():
+    times, condition = torch.tensor([[1.0, 2], [3, 9]]), torch.tensor([0, 1])
+    plans = RecordedPlans(torch.tensor([[0, 1], [1, 0]]), 2, torch.tensor([2, 1]), durations=times, condition=condition)
+    assert plans.durations.tolist() == [[1, 2], [3, 0]]
+    assert plans[1:].durations.tolist() == [[3, 0]]
+    assert plans[torch.tensor([1])].condition.tolist() == [1]
+    closed = plans.with_end()
+    assert closed.durations.tolist() == [[1, 2, 0], [3, 0, 0]]
+    assert closed.without_end().durations.tolist() == [[1, 2], [3, 0]]
+    first, last = plans[:1].split(0.5)
+    assert (first.durations.tolist(), last.durations.tolist()) == ([[1]], [[2]])
+    for fields, words in (
+        ({"durations": torch.tensor([[1.0, -1], [1, 1]])}, "durations[0, 1]"),
+        ({"durations": torch.tensor([[1.0, torch.inf], [1, 1]])}, "durations[0, 1]"),
+        ({"durations": torch.ones(2)}, "`durations` must have shape"),
+        ({"condition": torch.tensor([0.5, 1])}, "condition"),
+    ):
+        with refuses(words):
+            RecordedPlans(plans.actions, 2, **fields)
