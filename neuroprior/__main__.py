@@ -9,7 +9,9 @@ with ending_at_interrupts():
     from neuroprior.cli.program import Command, run_commands
 
 COMMANDS = {
-    "check": Command("neuroprior.cli.check:check", "show what files of behaviour are read as, and what is wrong in them"),
+    "check": Command(
+        "neuroprior.cli.check:check", "show what files of behaviour are read as, and what is wrong in them"
+    ),
     "fit": Command("neuroprior.cli.fit:run", "train a prior on executed plans and save it", raw=True),
     "report": Command(
         "neuroprior.behaviour.report.command:plans", "report on a file of plans: structure, models, figures"

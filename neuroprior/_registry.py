@@ -46,7 +46,11 @@ class Registry(Generic[T]):
         return list(self._entries.items())
 
 
+_ADDING = {"neuroprior.behaviour": "neuroprior.behaviour.durations.semi_markov"}
+"""The modules of wings that add to the registries, where it is not the wing itself."""
+
+
 def import_wings() -> None:
     """Import all wings, which add what they have to the registries."""
     for wing in WINGS:
-        import_module(wing)
+        import_module(_ADDING.get(wing, wing))

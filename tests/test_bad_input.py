@@ -22,11 +22,11 @@ from neuroprior import (
     write_plans,
 )
 from neuroprior.__main__ import main
+from neuroprior.behaviour import read
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.report import FitOptions, ReadOptions
 from neuroprior.behaviour.report.figures import ethogram_figure
 from neuroprior.behaviour.report.plan_report import report
-from neuroprior.behaviour.tables import plans_of_frame
 from neuroprior.control import ICEMPlanner, PlanarArm, control
 from neuroprior.planners import FrontierPlanner, expected_score
 from neuroprior.plans import folds
@@ -120,12 +120,10 @@ FITTED = {"a": UniformPrior(2)}
         (lambda: Plans(ACTIONS, 2, end=True), ["end", "True"]),
         (lambda: Plans(ACTIONS, 2, action_names=iter("ab")), ["action_names", "list of texts"]),
         (lambda: RecordedPlans(ACTIONS, 2, notes=3), ["notes", "list of texts"]),
-        (lambda: plans_of_frame(pd.DataFrame({"action": [[1], [2]]})), ["column 'action'", "names or numbers"]),
-        (lambda: plans_of_frame(pd.DataFrame([[1, 2]], columns=["action"] * 2)), ["'action'", "twice"]),
-        (
-            lambda: plans_of_frame(pd.DataFrame({"action": [0], "x": [1.5]}), {"context": ["x", "x"]}),
-            ["columns.context", "twice"],
-        ),
+        (lambda: read(pd.DataFrame({"x": [0.5]})), ["--columns.behaviour", "x"]),
+        (lambda: read(pd.DataFrame({"action": ["a"]}), {"action": "action"}), ["columns", "behaviour", "'action'"]),
+        (lambda: read(3), ["paths", "int"]),
+        (lambda: read(pd.DataFrame({"action": ["a"]}), missing="drop"), ["missing", "gap", "'drop'"]),
         (lambda: fit(PLANS, 3), ["prior", "a class", "3"]),
         (lambda: fit(PLANS, None), ["prior", "a class", "None"]),
         (lambda: CombinedPrior(2, ["gru"]), ["must be a prior", "'gru'"]),

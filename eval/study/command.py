@@ -11,17 +11,16 @@ from jsonargparse.typing import NonNegativeInt, PositiveInt
 from scipy import stats
 
 from neuroprior._jobs import JobRun
-from neuroprior.behaviour import compare_conditions, share_interval, simulated_study
+from neuroprior.behaviour import Columns, compare_conditions, read, share_interval, simulated_study
 from neuroprior.behaviour.report.document import Document, publish, table
 from neuroprior.behaviour.report.page import Section, Table
 from neuroprior.behaviour.study import LONGER, MOVED
-from neuroprior.behaviour.tables import Columns, plans_of_frame
 
 LEVEL = 0.05
 TOGETHER = 10
 """Studies of one job."""
 
-COLUMNS = Columns(action="behaviour", plan="session", group="animal", condition="treatment")
+COLUMNS = Columns(behaviour="behaviour", recording="session", subject="animal", factors="treatment")
 
 PLANTED = {("transitions", MOVED[0], MOVED[1]), ("transitions", MOVED[0], MOVED[2]), ("durations", LONGER[0])}
 """The features that the treatment changes; shares of actions and of longer sequences change as a consequence."""
@@ -101,7 +100,7 @@ def compared(numbers: dict[str, int], batch: Batch) -> list[dict[str, Any]]:
     for number in range(first, min(first + TOGETHER, total)):
         seed = numbers["seed"] + number
         events = simulated_study(seed, effect=batch.effect, within=batch.within, alike=batch.alike)
-        plans = plans_of_frame(events, COLUMNS)
+        plans = read(events, COLUMNS).plans()
         names = list(plans.action_names or ())
         one = compare_conditions(plans, generator=torch.Generator().manual_seed(seed))
         tests = one.tests | {"all together": (one.p_value, one.p_value)}

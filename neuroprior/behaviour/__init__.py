@@ -1,67 +1,66 @@
-"""Wing 1: recorded behaviour: tables of events, durations, statistics of sequences, tests, the report.
+"""Wing 1: recorded behaviour: recordings, durations, statistics of sequences, tests, the report.
 
-The report is in `neuroprior.behaviour.report`; intervals and tests in `neuroprior._statistics`.
+The report is in `neuroprior.behaviour.report`; intervals and tests in `neuroprior._statistics`. A room is imported when
+one of its names is first used: `read` and `Recordings` need no torch, which takes seconds.
 """
 
-from neuroprior._statistics import (
-    Difference,
-    Interval,
-    holm,
-    mean_interval,
-    paired_difference,
-    ratio_difference,
-    share_interval,
-)
-from neuroprior.behaviour.analysis.comparison import (
-    Baseline,
-    Score,
-    action_bits,
-    baselines,
-    score,
-    score_bits,
-    unit_name,
-    units,
-)
-from neuroprior.behaviour.analysis.conditions import (
-    ConditionComparison,
-    ConditionFamily,
-    ConditionPrediction,
-    compare_conditions,
-)
-from neuroprior.behaviour.analysis.drift import (
-    ActionDrift,
-    GroupDrift,
-    PlanDrift,
-    PositionDrift,
-    action_drift,
-    by_group,
-    by_plan,
-    by_position,
-)
-from neuroprior.behaviour.analysis.lags import LagInformation, mutual_information
-from neuroprior.behaviour.analysis.modes import (
-    ModeChoice,
-    choose_modes,
-    mode_frame,
-    mode_plans,
-    mode_table,
-)
-from neuroprior.behaviour.analysis.motifs import Motif, motifs
-from neuroprior.behaviour.analysis.permutation_design import PermutationDesign
-from neuroprior.behaviour.analysis.transitions import Transitions, transitions
-from neuroprior.behaviour.durations.duration_model import DurationLaw, DurationModel
-from neuroprior.behaviour.durations.laws import LAW_NAMES, LawName
-from neuroprior.behaviour.durations.past_durations import PastDurations
-from neuroprior.behaviour.durations.semi_markov import SemiMarkovPrior
-from neuroprior.behaviour.recorded_plans import RecordedPlans
-from neuroprior.behaviour.study import simulated_study
-from neuroprior.priors.fitting import PRIORS
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-PRIORS.add("semi-markov", SemiMarkovPrior)
+if TYPE_CHECKING:
+    from neuroprior._statistics import (
+        Difference,
+        Interval,
+        holm,
+        mean_interval,
+        paired_difference,
+        ratio_difference,
+        share_interval,
+    )
+    from neuroprior.behaviour.analysis.comparison import (
+        Baseline,
+        Score,
+        action_bits,
+        baselines,
+        score,
+        score_bits,
+        unit_name,
+        units,
+    )
+    from neuroprior.behaviour.analysis.conditions import (
+        ConditionComparison,
+        ConditionFamily,
+        ConditionPrediction,
+        compare_conditions,
+    )
+    from neuroprior.behaviour.analysis.drift import (
+        ActionDrift,
+        GroupDrift,
+        PlanDrift,
+        PositionDrift,
+        action_drift,
+        by_group,
+        by_plan,
+        by_position,
+    )
+    from neuroprior.behaviour.analysis.lags import LagInformation, mutual_information
+    from neuroprior.behaviour.analysis.modes import ModeChoice, choose_modes, mode_frame, mode_plans, mode_table
+    from neuroprior.behaviour.analysis.motifs import Motif, motifs
+    from neuroprior.behaviour.analysis.permutation_design import PermutationDesign
+    from neuroprior.behaviour.analysis.transitions import Transitions, transitions
+    from neuroprior.behaviour.durations.duration_model import DurationLaw, DurationModel
+    from neuroprior.behaviour.durations.laws import LAW_NAMES, LawName
+    from neuroprior.behaviour.durations.past_durations import PastDurations
+    from neuroprior.behaviour.durations.semi_markov import SemiMarkovPrior
+    from neuroprior.behaviour.reading import Columns, Options, ReadingError, read
+    from neuroprior.behaviour.recorded_plans import RecordedPlans
+    from neuroprior.behaviour.recordings import Recordings
+    from neuroprior.behaviour.study import simulated_study
 
 __all__ = [
     "ActionDrift",
     "Baseline",
+    "Columns",
     "ConditionComparison",
     "ConditionFamily",
     "ConditionPrediction",
@@ -75,11 +74,14 @@ __all__ = [
     "LawName",
     "ModeChoice",
     "Motif",
+    "Options",
     "PastDurations",
     "PermutationDesign",
     "PlanDrift",
     "PositionDrift",
+    "ReadingError",
     "RecordedPlans",
+    "Recordings",
     "Score",
     "SemiMarkovPrior",
     "Transitions",
@@ -100,6 +102,7 @@ __all__ = [
     "mutual_information",
     "paired_difference",
     "ratio_difference",
+    "read",
     "score",
     "score_bits",
     "share_interval",
@@ -108,3 +111,38 @@ __all__ = [
     "unit_name",
     "units",
 ]
+
+_ROOMS = (
+    "neuroprior.behaviour.reading",
+    "neuroprior.behaviour.recordings",
+    "neuroprior._statistics",
+    "neuroprior.behaviour.analysis.comparison",
+    "neuroprior.behaviour.analysis.conditions",
+    "neuroprior.behaviour.analysis.drift",
+    "neuroprior.behaviour.analysis.lags",
+    "neuroprior.behaviour.analysis.modes",
+    "neuroprior.behaviour.analysis.motifs",
+    "neuroprior.behaviour.analysis.permutation_design",
+    "neuroprior.behaviour.analysis.transitions",
+    "neuroprior.behaviour.durations.duration_model",
+    "neuroprior.behaviour.durations.laws",
+    "neuroprior.behaviour.durations.past_durations",
+    "neuroprior.behaviour.durations.semi_markov",
+    "neuroprior.behaviour.recorded_plans",
+    "neuroprior.behaviour.study",
+)
+"""Where the names above are: first those that need no torch."""
+
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> Any:
+        if name in __all__:
+            for room in map(import_module, _ROOMS):
+                if name in vars(room):
+                    globals()[name] = getattr(room, name)
+                    return globals()[name]
+        raise AttributeError(f"module 'neuroprior.behaviour' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,12 +1,17 @@
 """Plans that are parts of recordings of behaviour: with times, conditions and the names of the recordings."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import numpy as np
+import pandas as pd
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from neuroprior._checks import is_number
+from neuroprior.plans.columns import as_single, check_names, listed, padded
 from neuroprior.plans.plans import Plans, as_integers, as_numbers, check_numbered, check_shape, check_texts
 
 
@@ -93,3 +98,142 @@ def durations_of(plans: Plans) -> Tensor:
             "durations: these plans have none; give RecordedPlans(durations=), or a file with start and stop times"
         )
     return durations
+
+
+def plans_of_events(
+    events: pd.DataFrame,
+    fragment: NDArray[np.int64],
+    *,
+    factor: str | None,
+    context: Sequence[str],
+    notes: list[str],
+    max_gap: float | None,
+    num_actions: int | None,
+    action_names: Sequence[str] | None,
+    unknown: str,
+) -> RecordedPlans:
+    """Return the plans of the events of recordings; see `Recordings.plans`.
+
+    Args:
+        events, fragment: of `Recordings`, of one observer.
+        factor: the column that is compared.
+        context: columns of what is known before each action.
+        notes: what was said of the recordings; what is noticed here is added.
+        max_gap, num_actions, action_names, unknown: see there.
+    """
+    if unknown not in ("error", "gap"):
+        raise ValueError(f"`unknown` must be error or gap, got {unknown!r}")
+    if max_gap is not None and not (is_number(max_gap) and 0 <= max_gap < np.inf):
+        raise ValueError(f"`max_gap` must be at least 0, got {max_gap!r}")
+    cut = np.diff(fragment, prepend=-1) != 0
+    if max_gap is not None:
+        cut |= _pauses(events, cut, max_gap, notes)
+    names = check_names(num_actions, action_names)
+    behaviour = events["behaviour"].to_numpy(object)
+    outside = np.zeros(len(events), bool)
+    labels = [str(label) for label in pd.unique(behaviour)]
+    if all(label.isdecimal() for label in labels) and not (names is not None and set(labels) <= set(names)):
+        actions = pd.to_numeric(events["behaviour"]).to_numpy(np.int64)
+        count = num_actions or (int(actions.max()) + 1 if names is None else len(names))
+        if names is not None:
+            order = listed([f"{number} = {name}" for number, name in enumerate(names)])
+            notes.append(f"the behaviours are numbers, which are taken for those of the names: {order}")
+        elif missing := sorted(set(range(min(count, 10_000))) - set(actions.tolist())):
+            verb = "occurs" if len(missing) == 1 else "occur"
+            notes.append(f"behaviours are numbers from 0 to {count - 1}, of which {listed(missing)} never {verb}")
+        outside = actions >= count
+        shown = f"0 to {count - 1}"
+    else:
+        names = tuple(sorted(labels)) if names is None else names
+        count, shown = len(names), ", ".join(names)
+        actions = pd.Index(list(names)).get_indexer(behaviour).astype(np.int64)
+        outside = actions < 0
+    if outside.any() and unknown == "error":
+        label, row = behaviour[outside][0], events.iloc[int(outside.argmax())]
+        raise ValueError(
+            f"recording {row['recording']!r}: behaviour {label!r} is none of {shown} ({int(outside.sum()):,} events);"
+            " --rename it, --drop it, or --unknown gap ends plans there"
+        )
+    if outside.any():
+        notes.append(f"{int(outside.sum()):,} events are of behaviours that are not known; plans end there")
+        cut[1:] |= outside[:-1]
+        whole = np.cumsum(cut | outside)[~outside]
+        events, actions, cut = events[~outside], actions[~outside], np.diff(whole, prepend=-1) != 0
+    if not len(actions):
+        raise ValueError("`action_names` must hold a behaviour of the recordings, got none")
+    starts = np.flatnonzero(cut)
+    lengths = np.diff(np.append(starts, len(actions)))
+    first = events.iloc[starts]
+
+    def wide(values: Any) -> Tensor:
+        return torch.from_numpy(padded(np.array(values), lengths, "recordings"))
+
+    group, subjects = pd.factorize(first["subject"], sort=True)
+    begun = events["start"].to_numpy(np.float64)
+    seconds = (events["stop"] - events["start"]).to_numpy(np.float32)
+    fields: dict[str, Any] = _context_fields(context, events, wide, notes)
+    if factor is not None:
+        codes, levels = pd.factorize(first[factor], sort=True)
+        if (codes < 0).any() or "" in set(levels):
+            raise ValueError(f"`condition` must be known for each recording, got an empty {factor!r} in some")
+        fields |= {"condition": torch.from_numpy(codes.astype(np.int64)), "condition_names": tuple(map(str, levels))}
+    return RecordedPlans(
+        wide(actions),
+        count,
+        None if (lengths == lengths.max()).all() else torch.from_numpy(lengths),
+        names,
+        group=torch.from_numpy(group.astype(np.int64)),
+        group_names=tuple(map(str, subjects)),
+        recording=tuple(first["recording"]),
+        began=None if np.isnan(begun).all() else wide(begun),
+        durations=None if np.isnan(seconds).all() else wide(seconds),
+        notes=tuple(notes),
+        **fields,
+    )
+
+
+def _pauses(events: pd.DataFrame, cut: NDArray[np.bool_], max_gap: float, notes: list[str]) -> NDArray[np.bool_]:
+    """Return which events begin more than `max_gap` after all before them ended."""
+    start = events["start"].to_numpy(np.float64)
+    if np.isnan(start).all():
+        raise ValueError("`max_gap` must be left out where no times are known")
+    ends = events["stop"].fillna(events["start"])
+    if unknown := int(events["stop"].isna().sum()):
+        notes.append(f"{unknown:,} events without a stop count for max_gap as ended when they began")
+    latest = ends.groupby(np.cumsum(cut)).cummax().to_numpy(np.float64)
+    pause = np.zeros(len(start), bool)
+    error = 4 * np.spacing(np.maximum(np.abs(start[1:]), np.abs(latest[:-1])))
+    pause[1:] = start[1:] - latest[:-1] > max_gap + error
+    return pause
+
+
+def _context_fields(
+    columns: Sequence[str], events: pd.DataFrame, wide: Callable[[Any], Tensor], notes: list[str]
+) -> dict[str, Any]:
+    """Return the context of each action: labels of one column, or features.
+
+    One column is features where some of its numbers are negative or not whole, or nearly all are different.
+    """
+    if not columns:
+        return {}
+    numbers = [
+        pd.to_numeric(events[name].str.replace(",", "."), errors="coerce").to_numpy(np.float64) for name in columns
+    ]
+    texts = events[columns[0]]
+    if len(columns) == 1 and not np.isfinite(numbers[0]).all():
+        if (empty := texts.eq("")).any():
+            raise ValueError(f"`columns.context` must be known for each event, got {int(empty.sum()):,} empty cells")
+        codes, labels = pd.factorize(texts, sort=True)
+        return {"context": wide(codes.astype(np.int64)), "context_names": tuple(map(str, labels))}
+    values = numbers[0]
+    measured = (values < 0).any() or (values % 1 != 0).any() or len(np.unique(values)) > max(20, 0.5 * len(values))
+    if len(columns) == 1 and not measured:
+        return {"context": wide(values.astype(np.int64))}
+    for name, one in zip(columns, numbers, strict=True):
+        if not np.isfinite(one).all():
+            row = events.iloc[int((~np.isfinite(one)).argmax())]
+            raise ValueError(f"`columns.context` must be numbers in {name!r}, got {row[name]!r}")
+    if len(columns) == 1:
+        notes.append(f"the context {columns[0]!r} is read as a measurement, not as one of several places")
+    features = np.stack(numbers, 1)
+    return {"context": wide(as_single("context", features))}

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # torch is imported only where plans are wanted
     from neuroprior.behaviour.recorded_plans import RecordedPlans
 
 KEYS = ["recording", "subject"]
@@ -66,11 +66,15 @@ class Recordings:
 
     def __repr__(self) -> str:
         """The numbers of what there is."""
-        count = self.events[["recording", "subject", "behaviour"]].nunique()
         return (
-            f"Recordings({len(self.events):,} events, {count['recording']:,} recordings, {count['subject']:,} subjects,"
-            f" {count['behaviour']:,} behaviours)"
+            f"Recordings({len(self.events):,} events, {self.num_recordings:,} recordings, {self.events['subject'].nunique():,}"
+            f" subjects, {self.events['behaviour'].nunique():,} behaviours)"
         )
+
+    @property
+    def num_recordings(self) -> int:
+        """The number of recordings: session 1 of two subjects is two."""
+        return len(self.events[KEYS].drop_duplicates()) + len(self.empty)
 
     @property
     def watched(self) -> pd.DataFrame:
@@ -139,7 +143,9 @@ class Recordings:
         events = self.events[new].assign(stop=last)
         unknown = self.events["stop"].isna().groupby(run).last().to_numpy()
         events["stop"] = np.where(unknown, np.nan, events["stop"])
-        return self._with(events, self.fragment[new], f"{(~new).sum():,} events repeat the one before, and are one with it")
+        return self._with(
+            events, self.fragment[new], f"{(~new).sum():,} events repeat the one before, and are one with it"
+        )
 
     def until_next(self) -> "Recordings":
         """Return the recordings with each stop that is not known at the start of the next event of the fragment."""
@@ -171,7 +177,9 @@ class Recordings:
         watched = self.watched
         time = (watched["stop"] - watched["start"]).groupby(watched["subject"]).sum()
         seconds = self.events.assign(seconds=self.events["stop"] - self.events["start"])
-        table = seconds.pivot_table(index="subject", columns="behaviour", values="seconds", aggfunc="sum", fill_value=0.0)
+        table = seconds.pivot_table(
+            index="subject", columns="behaviour", values="seconds", aggfunc="sum", fill_value=0.0
+        )
         return table.div(time.where(time > 0), axis=0)
 
     def agreement(self) -> pd.DataFrame:
@@ -197,7 +205,9 @@ class Recordings:
                     if pair["observer"].nunique() == 2:
                         rows += _both_done(pair, first, second)
         if not rows:
-            raise ValueError("`columns.observer` must name observers who scored the same recordings, got none in common")
+            raise ValueError(
+                "`columns.observer` must name observers who scored the same recordings, got none in common"
+            )
         times = pd.DataFrame(rows, columns=["first", "second", "behaviour", "both", "one", "other", "time"])
         total = times.groupby(["first", "second", "behaviour"], sort=False)[["both", "one", "other", "time"]].sum()
         same = (total["both"] + total["time"] - total["one"] - total["other"] + total["both"]) / total["time"]
@@ -213,7 +223,9 @@ class Recordings:
         rank = self.events["observer"].value_counts()
         score = self.events["observer"].map(rank)
         best = score.groupby([self.events[key] for key in KEYS]).transform("max")
-        first = self.events["observer"].where(score == best).groupby([self.events[key] for key in KEYS]).transform("min")
+        first = (
+            self.events["observer"].where(score == best).groupby([self.events[key] for key in KEYS]).transform("min")
+        )
         kept = (self.events["observer"] == first).to_numpy()
         if kept.all():
             return self
@@ -241,10 +253,22 @@ class Recordings:
         Raises:
             ValueError: an argument is out of range, or a behaviour that is none of the names.
         """
-        from neuroprior.behaviour.recorded_plans import plans_of_recordings
+        from neuroprior.behaviour.recorded_plans import plans_of_events
 
-        return plans_of_recordings(
-            self, max_gap=max_gap, condition=condition, num_actions=num_actions, action_names=action_names, unknown=unknown
+        if condition is not None and condition not in self.factors:
+            some = ", ".join(self.factors) or "none; name its column (--columns.factors)"
+            raise ValueError(f"`condition` must be a factor of the recordings, {some}, got {condition!r}")
+        kept = self.of_one_observer()
+        return plans_of_events(
+            kept.events,
+            kept.fragment,
+            factor=condition or (self.factors[0] if len(self.factors) == 1 else None),
+            context=kept.context,
+            notes=list(kept.notes),
+            max_gap=max_gap,
+            num_actions=num_actions,
+            action_names=action_names,
+            unknown=unknown,
         )
 
 
@@ -284,7 +308,9 @@ def near_names(names: Sequence[str]) -> dict[str, list[str]]:
     short = ["".join(letter for letter in name.casefold() if letter.isalnum()) for name in names]
     for i, one in enumerate(short):
         for j in range(i):
-            if one == short[j] and one or (_one_letter_apart(one, short[j]) and not any(map(str.isdigit, one + short[j]))):
+            if (one == short[j] and one) or (
+                _one_letter_apart(one, short[j]) and not any(map(str.isdigit, one + short[j]))
+            ):
                 close.setdefault(names[j], []).append(names[i])
                 close.setdefault(names[i], []).append(names[j])
     return {name: close[name] for name in names if name in close}

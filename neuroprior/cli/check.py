@@ -28,7 +28,9 @@ def check(files: list[str], reading: Options = Options()) -> None:  # noqa: B008
     try:
         recordings = read_recordings(files, reading)
     except ReadingError as error:
-        raise ValueError("\n".join(f"- {problem}" for problem in error.problems) if error.problems[1:] else str(error)) from None
+        for problem in error.problems:
+            console.print(f"problem: {problem}", markup=False)
+        raise ValueError(f"{len(error.problems)} problems, and nothing is read") from None
     for line in describe(recordings):
         console.print(line, markup=False) if isinstance(line, str) else console.print(line)
     words = [*files, *reading_words(reading)]
@@ -42,7 +44,7 @@ def describe(recordings: Recordings) -> Iterator[str | Table]:
     unit = recordings.unit or "units"
     time = float((watched["stop"] - watched["start"]).sum())
     yield (
-        f"{len(events):,} events of {events['behaviour'].nunique():,} behaviours, {events['recording'].nunique():,} recordings"
+        f"{len(events):,} events of {events['behaviour'].nunique():,} behaviours, {recordings.num_recordings:,} recordings"
         f" of {events['subject'].nunique():,} subjects"
     )
     gaps = len(watched) - len(watched[["recording", "subject"]].drop_duplicates())
@@ -54,17 +56,21 @@ def describe(recordings: Recordings) -> Iterator[str | Table]:
         yield f"recordings without events: {', '.join(recordings.empty[:MAX_ROWS])}"
     yield _table("Behaviours", recordings.behaviours(), all_rows=True)
     for factor in recordings.factors:
-        counts = events.drop_duplicates(["recording", "subject"]).groupby(["subject", factor]).size().unstack(fill_value=0)
+        counts = (
+            events.drop_duplicates(["recording", "subject"]).groupby(["subject", factor]).size().unstack(fill_value=0)
+        )
         yield _table(f"Recordings by {factor}", _with_total(counts).reset_index())
-    first = events[(events["recording"] == events["recording"].iloc[0]) & (events["subject"] == events["subject"].iloc[0])]
+    first = events[
+        (events["recording"] == events["recording"].iloc[0]) & (events["subject"] == events["subject"].iloc[0])
+    ]
     yield _table("The first events", first.head(SHOWN_EVENTS))
 
 
 def _with_total(counts: pd.DataFrame) -> pd.DataFrame:
     """Return a table of recordings with the number of subjects of each level as its last row."""
-    return pd.concat([counts, pd.DataFrame({level: [(counts[level] > 0).sum()] for level in counts}, index=["subjects"])]).rename_axis(
-        "subject"
-    )
+    return pd.concat(
+        [counts, pd.DataFrame({level: [(counts[level] > 0).sum()] for level in counts}, index=["subjects"])]
+    ).rename_axis("subject")
 
 
 def _sources(sources: Sequence[Source]) -> Iterator[str | Table]:
@@ -91,9 +97,13 @@ def _table(title: str, frame: pd.DataFrame, all_rows: bool = False) -> Table:
     table = Table(title=title, title_justify="left", box=None, padding=(0, 2, 0, 0))
     shown = frame if all_rows else frame.head(MAX_ROWS)
     for name in frame.columns:
-        table.add_column(str(name), justify="right" if pd.api.types.is_numeric_dtype(frame[name]) else "left", overflow="fold")
+        table.add_column(
+            str(name), justify="right" if pd.api.types.is_numeric_dtype(frame[name]) else "left", overflow="fold"
+        )
     for row in shown.itertuples(index=False):
-        table.add_row(*("" if value is None else f"{value:,.6g}" if isinstance(value, float) else str(value) for value in row))
+        table.add_row(
+            *("" if value is None else f"{value:,.6g}" if isinstance(value, float) else str(value) for value in row)
+        )
     if len(shown) < len(frame):
         table.add_row(f"... {len(frame) - len(shown):,} more")
     return table

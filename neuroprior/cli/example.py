@@ -23,6 +23,4 @@ def example(file: str) -> None:
         raise ValueError(f"{place}: is there already; give another name")
     with written_whole(place) as stream:
         simulated_study(seed=0).to_csv(stream, index=False, lineterminator="\n")
-    columns = {"action": "behaviour", "plan": "session", "group": "animal", "condition": "treatment"}
-    options = " ".join(f"--columns.{what} {name}" for what, name in columns.items())
-    print(f"wrote {place}; next: neuroprior report {place} {options}")
+    print(f"wrote {place}; next: neuroprior check {place}")

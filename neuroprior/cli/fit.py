@@ -20,10 +20,10 @@ from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.report.document import printed, write_frames
 from neuroprior.behaviour.report.modes import choice_table
 from neuroprior.behaviour.report.options import ReadOptions
-from neuroprior.behaviour.tables import Columns, Missing
 from neuroprior.cli.fit_data import Parts, divide
 from neuroprior.cli.fit_report import report
 from neuroprior.cli.program import make_parser
+from neuroprior.cli.reading import add_reading_arguments, pop_reading
 from neuroprior.planners import Planner, collect
 from neuroprior.plans import write_plans
 from neuroprior.plans.io.npz import read_npz
@@ -72,7 +72,8 @@ def run(arguments: list[str]) -> None:
         KeyboardInterrupt: Ctrl-C; the message says how to go on.
     """
     parser = make_parser(fit, "neuroprior fit", skip={"plans", "training", "options"})
-    parser.add_argument("plans", nargs="?", type=str | None, default=None, help="File of plans, or minari:NAME.")
+    add_reading_arguments(parser, ReadOptions)
+    parser.add_argument("plans", nargs="*", type=str, default=[], help="Files of behaviour or plans, or minari:NAME.")
     parser.add_argument("--config", action=Recipe, help=f"A recipe: a file, or one of {', '.join(recipes())}.")
     parser.add_class_arguments(Settings, as_group=False, skip={"validation"})
     given = parser.parse_args(arguments)
@@ -85,21 +86,16 @@ def run(arguments: list[str]) -> None:
     options, made = parser.dump(given), parser.instantiate(given).as_dict()
     del made["config"]
     training = Settings(**{name: made.pop(name) for name in TRAINING})
-    fit(**made, training=training, options=options)
+    reading = pop_reading(made, ReadOptions)
+    fit(**made, training=training, options=options, reading=reading)
 
 
 def fit(
-    plans: str | None = None,
+    plans: list[str] | None = None,
     prior: Callable[[int], Prior] = CombinedPrior,
     effort: Effort | None = None,
     modes: list[PositiveInt] | None = None,
     use_context: bool = True,
-    num_actions: int | None = None,
-    action_names: list[str] | None = None,
-    columns: Columns | None = None,
-    missing: Missing = "gap",
-    merge_repeats: bool = False,
-    max_gap: float | None = None,
     world: World | None = None,
     planner: Planner | None = None,
     num_plans: int = 10_000,
@@ -114,24 +110,19 @@ def fit(
     out: str = "runs/prior",
     resume: str | None = None,
     options: str = "",
+    reading: ReadOptions = ReadOptions(),  # noqa: B008
 ) -> None:
     """Train a prior on executed plans, save it, and compare it with count-based ones.
 
     Args:
-        plans: file of plans: `.npz`, `.jsonl` or `.csv`, or `minari:` and the name of a Minari dataset.
+        plans: files of behaviour (see `neuroprior.behaviour.read`), or of plans: `.npz`, `.jsonl`, or `minari:` and
+            the name of a Minari dataset.
         prior: its class, such as GRUPrior; its own arguments go below it (`--prior.hidden_size 128`). The number of
             actions and of contexts come from the plans.
         effort: how much the combined prior spends on networks.
         modes: numbers of hidden modes of a SwitchingPrior to choose from: the fewest that predict held-out plans as
             well as the best.
         use_context: whether the prior takes the context of the plans, where they have one.
-        num_actions: number of actions, where the file does not say.
-        action_names: names of the actions in the order of their numbers, where the file does not say.
-        columns: which columns of a CSV file hold what: action, plan, context, group, condition, start, stop, duration,
-            event_type.
-        missing: what rows without a label do: a gap ends the plan; as label they count as an action; or error.
-        merge_repeats: take the same label in successive rows for one action, as in files with a row a frame.
-        max_gap: a longer pause between two actions ends the plan, too; in the unit of the starts.
         world: where plans are collected if no file is given, such as `neuroprior.worlds.gridworld`.
         planner: that chooses them, such as `ExhaustivePlanner`.
         num_plans: how many are collected.
@@ -150,14 +141,15 @@ def fit(
         out: folder of the run, new or empty.
         resume: folder of a run to go on with, in place of all other options.
         options: the options in YAML, to be kept in the folder.
+        reading: how files are read.
     """
     folder, generator = Path(resume or out), torch.Generator().manual_seed(seed)
     if resume is None and folder.exists() and any(folder.iterdir()):
         raise ValueError(f"`out` must be a new or empty folder, got {out}; --resume {out} goes on with a run there.")
     if resume is not None:
         source = read_npz(folder / PLANS, None, None, RecordedPlans)
-    elif plans is not None:
-        source = ReadOptions(columns, missing, merge_repeats, max_gap, num_actions, action_names).read(plans)
+    elif plans:
+        source = reading.read(plans)
     elif world is not None and planner is not None:
         source = RecordedPlans.of(collect(planner, world, num_plans, context=context, generator=generator))
     else:

@@ -94,15 +94,16 @@ def call(function: Callable[..., Any], program: str, arguments: Sequence[str]) -
     """
     parser, reading = make_parser(function, program), _reading_of(function)
     if reading is not None:
-        add_reading_arguments(parser)
+        add_reading_arguments(parser, reading[1])
     settings = parser.parse_args(list(arguments)).as_dict()
-    options = {} if reading is None else {reading: pop_reading(settings)}
+    options = {} if reading is None else {reading[0]: pop_reading(settings, reading[1])}
     return function(**{name: _plain(value) for name, value in settings.items()}, **options)
 
 
-def _reading_of(function: Callable[..., Any]) -> str | None:
-    """Return the parameter that says how recordings are read; its options are those of `Options`."""
-    return next((name for name, hint in get_type_hints(function).items() if hint is Options), None)
+def _reading_of(function: Callable[..., Any]) -> tuple[str, type[Options]] | None:
+    """Return the parameter that says how recordings are read, and its class; each of its fields is an option."""
+    hints = get_type_hints(function).items()
+    return next(((name, hint) for name, hint in hints if isinstance(hint, type) and issubclass(hint, Options)), None)
 
 
 def make_parser(function: Callable[..., Any], program: str, skip: Collection[str] = ()) -> Any:
@@ -124,8 +125,9 @@ def make_parser(function: Callable[..., Any], program: str, skip: Collection[str
     about = f"{described.short_description or ''} Options may be written with hyphens for underscores."
     parser = ArgumentParser(prog=program, description=about, exit_on_error=False, allow_abbrev=True)
     items = {name: item for name, hint in get_type_hints(function).items() if (item := _item_of(hint)) is not None}
-    reading = {_reading_of(function)} - {None}
-    parser.add_function_arguments(function, as_group=False, as_positional=True, skip={*items, *skip, *reading})
+    reading = _reading_of(function)
+    skipped = {*items, *skip, *(reading[:1] if reading else ())}
+    parser.add_function_arguments(function, as_group=False, as_positional=True, skip=skipped)
     for name, item in items.items():
         default = inspect.signature(function).parameters[name].default
         if default is inspect.Parameter.empty:

@@ -3,32 +3,38 @@
 import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from typing import Any, get_origin, get_type_hints
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from neuroprior.behaviour.reading import Columns, Options
+
+T = TypeVar("T", bound=Options)
 
 SPELLED = {"from_": "from"}
 """Options whose names are words of Python."""
 
 
-def add_reading_arguments(parser: Any) -> None:
-    """Add an option to a parser (jsonargparse's) for each of `Options` and, as `--columns.NAME`, of `Columns`."""
-    texts = {**_described(Options), **{f"columns.{name}": text for name, text in _described(Columns).items()}}
+def add_reading_arguments(parser: Any, kind: type[Options]) -> None:
+    """Add an option to a parser (jsonargparse's) for each of `kind` and, as `--columns.NAME`, of `Columns`."""
+    texts = {
+        **_described(Options),
+        **_described(kind),
+        **{f"columns.{name}": text for name, text in _described(Columns).items()},
+    }
     for field in fields(Columns):
         name = f"columns.{field.name}"
         parser.add_argument(f"--{name}", nargs="+", type=str, default=None, help=texts[name])
-    hints = get_type_hints(Options)
-    for field in fields(Options):
-        kind, text = hints[field.name], texts[field.name]
+    hints = get_type_hints(kind)
+    for field in fields(kind):
+        hint, text = hints[field.name], texts[field.name]
         flag = f"--{SPELLED.get(field.name, field.name)}"
         if field.name == "columns":
             continue
-        if get_origin(kind) is Mapping:
+        if get_origin(hint) is Mapping:
             parser.add_argument(flag, nargs="+", type=str, default=None, help=f"{text} As OLD=NEW.")
-        elif get_origin(kind) is Sequence:
+        elif Sequence in {get_origin(one) for one in (hint, *get_args(hint))}:
             parser.add_argument(flag, nargs="*", type=str, default=None, help=text)
         else:
-            parser.add_argument(flag, type=kind, default=field.default, help=text)
+            parser.add_argument(flag, type=hint, default=field.default, help=text)
 
 
 def _described(kind: type) -> dict[str, str]:
@@ -40,7 +46,7 @@ def _described(kind: type) -> dict[str, str]:
     return {name: " ".join((entry.description or "").split()).capitalize() for name, entry in found.items()}
 
 
-def pop_reading(settings: dict[str, Any]) -> Options:
+def pop_reading(settings: dict[str, Any], kind: type[T]) -> T:
     """Take the options that `add_reading_arguments` added out of the settings of a command.
 
     Raises:
@@ -48,12 +54,12 @@ def pop_reading(settings: dict[str, Any]) -> Options:
     """
     columns = {use: names[0] if len(names) == 1 else names for use, names in settings.pop("columns").items() if names}
     given: dict[str, Any] = {"columns": columns}
-    for field in fields(Options):
+    for field in fields(kind):
         value = settings.pop(SPELLED.get(field.name, field.name), None)
         if value is None:
             continue
         given[field.name] = _pairs(field.name, value) if field.name in ("words", "rename") else value
-    return Options(**given)
+    return kind(**given)
 
 
 def _pairs(name: str, texts: Sequence[str]) -> dict[str, str]:

@@ -10,10 +10,7 @@ from rich.console import Console
 from neuroprior.behaviour.analysis.comparison import action_bits, score_bits, too_few, unit_name
 from neuroprior.behaviour.durations.past_durations import PastDurations
 from neuroprior.behaviour.report.document import printed, table, write_frames
-from neuroprior.behaviour.report.options import ReadOptions
-from neuroprior.behaviour.tables import Columns, Missing
-from neuroprior.plans import Plans
-from neuroprior.plans.io import is_table
+from neuroprior.behaviour.report.options import ReadOptions, is_recording, name_files
 from neuroprior.priors import load
 from neuroprior.priors.matching import learned_names, match_plans, numbered_note, taken_note, with_contexts_of
 from neuroprior.priors.scoring import learned_from, scores_by
@@ -27,14 +24,9 @@ MOST_ROWS = 20
 
 def score(
     folder: str,
-    file: str,
-    num_actions: int | None = None,
-    action_names: list[str] | None = None,
-    columns: Columns | None = None,
-    missing: Missing = "gap",
-    merge_repeats: bool = False,
-    max_gap: float | None = None,
+    files: list[str],
     out: str = "runs/score",
+    reading: ReadOptions = ReadOptions(),  # noqa: B008
 ) -> None:
     """Score plans under a saved prior: log-likelihood and bits per action, of each plan and each group.
 
@@ -42,23 +34,16 @@ def score(
 
     Args:
         folder: a saved prior, as `neuroprior fit` writes it.
-        file: plans: `.npz`, `.jsonl` or `.csv`, or `minari:` and the name of a Minari dataset.
-        num_actions: number of actions, where the file does not say.
-        action_names: names of the actions in the order of their numbers, where the file does not say.
-        columns: which columns of a CSV file hold what: action, plan, context, group, condition, start, stop, duration,
-            event_type.
-        missing: what rows without a label do: a gap ends the plan; as label they count as an action; or error.
-        merge_repeats: take the same label in successive rows for one action, as in files with a row a frame.
-        max_gap: a longer pause between two actions ends the plan, too; in the unit of the starts.
+        files: of behaviour (see `neuroprior.behaviour.read`), or of plans: `.npz`, `.jsonl`, or `minari:` and the name
+            of a Minari dataset.
         out: folder for `plans.csv` and, where there are any, `groups.csv` and `conditions.csv`.
+        reading: how files are read.
     """
     prior, place = load(folder), Path(out)
-    plain = ReadOptions(columns, missing, merge_repeats, max_gap, num_actions)
     known = learned_names(prior)
-    tabular = is_table(file)
-    # Numbers in a CSV file are the prior's own; its names make sure that there are as many.
-    plans = replace(plain, action_names=action_names or (known if tabular else None)).read(file)
-    by_number = plans.action_names is None or (tabular and action_names is None and _by_number(plans, file, plain))
+    tabular = is_recording(files)
+    # Numbers in a table are the prior's own; its names make sure that there are as many.
+    plans = replace(reading, action_names=reading.action_names or (known if tabular else None)).read(files)
     plans = plans if plans.end is None else plans.without_end()
     plans, notes = with_contexts_of(prior, plans, tabular)
     own, past = match_plans(plans, prior, folder), PastDurations.load(Path(folder))
@@ -91,15 +76,17 @@ def score(
             " part."
         )
     notes = [*plans.notes, *notes]
-    if plans.action_names and action_names is None and prior.action_names is None:
+    if plans.action_names and reading.action_names is None and prior.action_names is None:
         notes.append(f"{numbered_note('actions', plans.action_names)}; --action_names orders them")
-    if by_number and known is not None:
+    if plans.action_names is None and known is not None:
         notes.append(taken_note("actions", known))
     place.mkdir(parents=True, exist_ok=True)
     console = Console()
     for note in notes:
         console.print(f"note: {note}", highlight=False, markup=False, soft_wrap=True)
-    console.print(printed(f"{Path(file).name} under {folder}", table(frame.head(MOST_ROWS), first | numbers, caption)))
+    console.print(
+        printed(f"{name_files(files)} under {folder}", table(frame.head(MOST_ROWS), first | numbers, caption))
+    )
     interval = f"95 % interval {whole.low:.4f} to {whole.high:.4f} over {unit_name(plans)}"
     few = too_few(plans)
     console.print(f"{whole.mean:.4f} bits per action, {interval}{few and f'; {few}'}", highlight=False)
@@ -108,14 +95,6 @@ def score(
     console.print(
         f"tables: {', '.join(str(place / f'{name}.csv') for name in frames)}", highlight=False, soft_wrap=True
     )
-
-
-def _by_number(plans: Plans, file: str, reading: ReadOptions) -> bool:
-    """Whether actions in the table that plans were read from are numbers, and none of the prior's names."""
-    with suppress(ValueError):  # without the names of the prior it might not be read
-        plain = reading.read(file)
-        return plain.action_names is None and plain.actions.equal(plans.actions)
-    return False
 
 
 def _is_of_scores(file: Path) -> bool:

@@ -4,8 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from neuroprior.behaviour import simulated_study
-from neuroprior.behaviour.tables import plans_of_frame
+from neuroprior.behaviour import read, simulated_study
 
 
 def followed(study, first, second, treatment):
@@ -56,7 +55,7 @@ def test_designs(within) -> None:
     sessions = study.groupby(["animal", "session"]).treatment
     assert (sessions.nunique() == 1).all()
     assert (sessions.first() == "drug").sum() == 12
-    plans = plans_of_frame(study, {"action": "behaviour", "plan": "session", "group": "animal"})
+    plans = read(study).plans()
     assert plans.durations is not None
     assert len(plans.group.unique()) == 12
 

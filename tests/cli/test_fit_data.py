@@ -35,17 +35,16 @@ def fitted(monkeypatch, tmp_path):
 
 
 def test_how_a_file_is_read_is_passed_on(monkeypatch, fitted):
-    options = {"num_actions": 3, "action_names": ["a", "b", "c"], "columns": object(), "missing": "label"}
-    options |= {"merge_repeats": True, "max_gap": 3.5}
+    reading = ReadOptions(num_actions=3, missing="label", merge_repeats=True, max_gap=3.5)
     asked = []
 
-    def read(options, file):
-        asked.append((file, vars(options)))
+    def read(options, files):
+        asked.append((files, options))
         return RecordedPlans.of(drawn(40))
 
     monkeypatch.setattr(ReadOptions, "read", read)
-    fitted(plans="plans.csv", **options)
-    assert asked == [("plans.csv", options)]
+    fitted(plans=["a.csv", "b.csv"], reading=reading)
+    assert asked == [(["a.csv", "b.csv"], reading)]
 
 
 @pytest.mark.parametrize(("context", "shape"), [(None, None), ("plan", (20, 2)), ("step", (20, 2))])

@@ -11,10 +11,10 @@ import torch
 
 from neuroprior import MarkovPrior, Plans, save
 from neuroprior.__main__ import main
+from neuroprior.behaviour import read
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.report import ReadOptions
 from neuroprior.behaviour.report.plan_report import report
-from neuroprior.behaviour.tables import read_events
 from neuroprior.cli import score as command
 from neuroprior.plans import write_plans
 from neuroprior.priors.scoring import keep_learned
@@ -44,7 +44,7 @@ def scored(folder, plans, learned=(), **options):
     if learned:
         keep_learned(folder / "prior", *learned)
     write_plans(plans, folder / "plans.npz")
-    command.score(str(folder / "prior"), str(folder / "plans.npz"), out=str(folder / "out"), **options)
+    command.score(str(folder / "prior"), [str(folder / "plans.npz")], out=str(folder / "out"), **options)
     return prior, {path.stem: pd.read_csv(path) for path in (folder / "out").glob("*.csv")}
 
 
@@ -63,7 +63,7 @@ def test_tables_of_an_earlier_file_go_and_those_of_others_stay(tmp_path):
     for content in ("plan,action\n0,1\n0,2\n", "model,bits_per_action\nmine,1\n"):
         plans.write_text(content)
         with refuses("out: ", "plans.csv is there, and holds no scores; give another folder"):
-            command.score(str(tmp_path / "prior"), str(tmp_path / "plans.npz"), out=str(plans.parent))
+            command.score(str(tmp_path / "prior"), [str(tmp_path / "plans.npz")], out=str(plans.parent))
         assert plans.read_text() == content
         assert list(plans.parent.iterdir()) == [plans]
 
@@ -121,12 +121,10 @@ def test_how_a_file_is_read_is_passed_on(file, given, names, tmp_path, monkeypat
     """The prior's names go with tables alone, unless others are given; notes are printed."""
     plans, asked = replace(drawn(8, action_names=("a", "b", "c")), notes=("something was odd",)), []
     save(MarkovPrior(3, 1).fit(plans), tmp_path / "prior")
-    monkeypatch.setattr(ReadOptions, "read", lambda how, file: asked.append((file, vars(how))) or plans)
-    options = {"missing": "label", "merge_repeats": True, "max_gap": 3.5, "columns": object(), "num_actions": 3}
-    command.score(str(tmp_path / "prior"), file, action_names=given, out=str(tmp_path / "out"), **options)
-    assert asked[0] == (file, {**options, "action_names": names})
-    plain = {**options, "action_names": None}
-    assert all(again == (file, plain) for again in asked[1:])  # to see whether a table holds numbers
+    monkeypatch.setattr(ReadOptions, "read", lambda how, files: asked.append((files, how)) or plans)
+    reading = ReadOptions(missing="label", merge_repeats=True, max_gap=3.5, num_actions=3, action_names=given)
+    command.score(str(tmp_path / "prior"), [file], out=str(tmp_path / "out"), reading=reading)
+    assert asked == [([file], replace(reading, action_names=names))]
     assert "note: something was odd" in capsys.readouterr().out
 
 
@@ -192,7 +190,7 @@ TAKEN = "contexts are numbers, which are taken for those of the prior's names: 0
     ],
 )
 def test_contexts_are_matched_by_name_or_it_is_said_how_they_are_numbered(learned, names, file, said, tmp_path, capsys):
-    plans = read_events(of_contexts(tmp_path / "learned.csv", learned))
+    plans = read(of_contexts(tmp_path / "learned.csv", learned)).plans()
     if learned == (1, 2):  # numbers in a table, which another file names
         plans = replace(plans, context=(plans.context - 1).clamp(min=0), context_names=names)
     prior = MarkovPrior(2, 0, num_contexts=2).fit(plans)

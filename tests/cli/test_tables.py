@@ -11,8 +11,8 @@ from neuroprior.__main__ import main
 
 pytestmark = pytest.mark.usefixtures("undrawn")
 
-COLUMNS = ["--columns.action", "behaviour", "--columns.plan", "session", "--columns.group", "animal"]
-COLUMNS += ["--columns.start", "t", "--columns.condition", "drug"]
+COLUMNS = ["--columns.behaviour", "behaviour", "--columns.recording", "session", "--columns.subject", "animal"]
+COLUMNS += ["--columns.start", "t", "--columns.factors", "drug"]
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def test_report_fit_and_score_read_it_alike(table, capsys):
     quick = ["--models", "counts", "--folds", "2", "--processes", "1"]
     assert main(["report", "lab.csv", *COLUMNS, *quick, "--out", "report"]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "16 rows have no label. 16 gaps end a plan" in said
+    assert "16 of 320 rows have no label (first in lab.csv, line 11)" in said
     results = json.loads(Path("report/results.json").read_text())
     assert results["file"]["plans"] == 32
     assert (results["file"]["groups"], results["file"]["conditions"]) == (8, 2)
@@ -61,9 +61,9 @@ def test_report_fit_and_score_read_it_alike(table, capsys):
     [
         (["--missing", "error", *COLUMNS], "lab.csv, line 11"),
         (["--missing", "drop", *COLUMNS], "gap"),
-        (["--columns.action", "act"], "'act'"),
+        (["--columns.behaviour", "act"], "'act'"),
         (["--columns.act", "behaviour"], "act"),
-        ([], "--columns.action"),
+        (["--rename", "rest"], "OLD=NEW"),
     ],
 )
 def test_bad_options_are_one_line(options, words, table, capsys):

@@ -15,6 +15,7 @@ from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.plans import Plans
 from neuroprior.priors.construction import as_prior, construct, described
 from neuroprior.priors.counts import MarkovPrior
+from neuroprior.priors.fitting import PRIORS
 from neuroprior.priors.learning import counted_plans, plans_for, training_plans
 from neuroprior.priors.prior import Prior
 
@@ -171,3 +172,6 @@ class SemiMarkovPrior(Prior):
             end=self.end,
         )
         return replace(plans, durations=self.durations.sample(plans, generator=generator))
+
+
+PRIORS.add("semi-markov", SemiMarkovPrior)

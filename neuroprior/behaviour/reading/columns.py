@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from neuroprior.behaviour.reading.names import NAMES, PROGRAMS, WORDS, Program, plain
+from neuroprior.behaviour.reading.names import DEEPETHOGRAM, NAMES, PROGRAMS, SIMBA, WORDS, Program, plain
 from neuroprior.behaviour.reading.problems import ReadingError
 from neuroprior.behaviour.reading.sheets import Sheet
 from neuroprior.behaviour.reading.times import count_times
@@ -21,6 +21,9 @@ MONTH = re.compile(r"(jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec)[a-z]*[._\
 STEM_NUMBER = re.compile(r"(.*?[^\d.])?[._\- ]?(\d+)")
 NO_BEHAVIOURS = re.compile(r"(low[_ ]prob|in zone|result|probability|arena|zone)", re.IGNORECASE)
 """Columns of zeros and ones that programs write beside those of behaviours."""
+
+MAX_CODES = 20
+"""Numbers that are not whole, such as doses, that may be labels."""
 
 MAX_OBSERVERS = 10
 """Observers at most, where their column is not named."""
@@ -140,7 +143,7 @@ def find_roles(sheet: Sheet, columns: Columns, words: Mapping[str, str]) -> Role
                 roles.at[use], roles.found = [column], {*roles.found, use}
         roles.layout = program.layout or "events"
     closed = {*named, *(program.columns if program else ())}
-    for use in ("event_type", "start", "stop", "duration", "recording", "subject", "observer", "factors"):
+    for use in ("event_type", "start", "stop", "duration", "recording", "subject", "observer", "factors", "context"):
         if use not in closed:
             _find_use(sheet, roles, use, words)
     _choose_behaviour(sheet, roles, "behaviour" in ranges, closed)
@@ -149,9 +152,14 @@ def find_roles(sheet: Sheet, columns: Columns, words: Mapping[str, str]) -> Role
         for use in ("start", "stop", "duration"):
             if use in roles.found:
                 del roles.at[use]
-        group = next((name for name in sheet.frame if plain(name) == "group" and name not in named.get("factors", [])), None)
+        group = next(
+            (name for name in sheet.frame if plain(name) == "group" and name not in named.get("factors", [])), None
+        )
         if "subject" not in roles.at and group and "subject" not in named:
-            roles.at["subject"], roles.at["factors"] = [group], [one for one in roles.at.get("factors", []) if one != group]
+            roles.at["subject"], roles.at["factors"] = (
+                [group],
+                [one for one in roles.at.get("factors", []) if one != group],
+            )
     _note_unused(sheet, roles, words)
     return roles
 
@@ -181,7 +189,9 @@ def _resolve(sheet: Sheet, columns: Columns) -> tuple[dict[str, list[str]], set[
             elif len(parts) > 1 and None not in parts:
                 chosen += map(str, parts)
             else:
-                missing = [part for part in name.split(",") if _column(sheet, part) is None] if len(parts) > 1 else [name]
+                missing = (
+                    [part for part in name.split(",") if _column(sheet, part) is None] if len(parts) > 1 else [name]
+                )
                 shown = ", ".join(every[:30]) + (", ..." if len(every) > 30 else "")
                 problems.append(f"{sheet.name}: `columns.{use}` must be one of {shown}, got {missing[0].strip()!r}")
         found[use] = list(dict.fromkeys(chosen))
@@ -225,7 +235,9 @@ def _drop_index(sheet: Sheet, roles: Roles) -> None:
         numbers = pd.to_numeric(sheet.frame[name], errors="coerce").to_numpy(np.float64)
         if len(numbers) and np.isfinite(numbers).all() and (np.diff(numbers) == 1).all() and numbers[0] in (0, 1):
             sheet.frame = sheet.frame.drop(columns=name)
-            roles.notes.append(f"the first column of {sheet.name} counts the rows, and is not used" if numbers.size else "")
+            roles.notes.append(
+                f"the first column of {sheet.name} counts the rows, and is not used" if numbers.size else ""
+            )
         elif sheet.frame[name].eq("").all():
             sheet.frame = sheet.frame.drop(columns=name)
 
@@ -268,6 +280,8 @@ def _find_use(sheet: Sheet, roles: Roles, use: str, words: Mapping[str, str]) ->
             kept = []
     elif use == "factors":
         kept = [name for name in candidates if sheet.frame[name].ne("").any()]
+    elif use == "context":
+        kept = _contexts(sheet, roles)
     else:
         kept = [name for name in candidates if sheet.frame[name].ne("").any()]
         if use == "observer":
@@ -275,8 +289,18 @@ def _find_use(sheet: Sheet, roles: Roles, use: str, words: Mapping[str, str]) ->
         elif candidates and not kept:
             roles.notes.append(f"the column {candidates[0]!r} is empty, and not used as {use}")
     if kept:
-        roles.at[use] = kept if use == "factors" else kept[:1]
+        roles.at[use] = kept if use in ("factors", "context") else kept[:1]
         roles.found.add(use)
+
+
+def _contexts(sheet: Sheet, roles: Roles) -> list[str]:
+    """Return the columns that are called context, or context_1, context_2, ..., if all their cells are filled."""
+    names = [name for name in sheet.frame if re.fullmatch(r"context( \d+)?", plain(name)) and name not in roles.used()]
+    empty = [name for name in names if sheet.frame[name].eq("").any()]
+    if empty:
+        roles.notes.append(f"the column {empty[0]!r} has empty cells, and is not used as context")
+        return []
+    return names
 
 
 def event_words(column: "pd.Series[Any]", words: Mapping[str, str]) -> set[str]:
@@ -306,13 +330,17 @@ def _choose_behaviour(sheet: Sheet, roles: Roles, is_range: bool, closed: set[st
     if "behaviour" in closed and roles.program and roles.program.layout == "columns of behaviours":
         known = []
     wide = _numbered_run(frame, free) if roles.program is None else []
-    if wide and (not known or len(wide) > 5 or plain(wide[0]).startswith(("action ", "behavior ", "behaviour "))):
+    if wide and (not known or len(wide) > 5 or _names_behaviours(wide)):
         roles.at["behaviour"], roles.layout = wide, "rows of sequences"
     elif known:
         text = [name for name in known if plain(name) != "name"] or known
         roles.at["behaviour"] = text[:1]
     elif indicators := _indicator_columns(frame, free):
         roles.at["behaviour"], roles.layout = indicators, "columns of behaviours"
+        if any(name.startswith("Probability_") for name in free):
+            roles.program = SIMBA
+        elif indicators[0].lower() == "background":
+            roles.program = DEEPETHOGRAM
     elif run := _labelled_run(frame, free):
         roles.at["behaviour"], roles.layout = run, "rows of sequences"
     elif (one := _only_label(frame, free)) and len(roles.at) > 0:
@@ -339,7 +367,10 @@ def _is_measured(column: "pd.Series[Any]") -> bool:
     numbers = pd.to_numeric(column[column != ""], errors="coerce")
     if not len(numbers) or numbers.isna().mean() > 0.1:
         return False
-    return bool((numbers % 1 != 0).mean() > 0.1) or bool(numbers.nunique() > max(300, 0.5 * len(numbers)) and len(numbers) > 600)
+    different = numbers.nunique()
+    if (numbers % 1 != 0).mean() > 0.1:
+        return different > MAX_CODES
+    return different > max(300, 0.5 * len(numbers)) and len(numbers) > 600
 
 
 def _indicator_columns(frame: pd.DataFrame, free: list[str]) -> list[str]:
@@ -373,8 +404,14 @@ def _runs(names: list[str]) -> list[list[str]]:
 def _numbered_run(frame: pd.DataFrame, free: list[str]) -> list[str]:
     """Return the longest run of numbered columns that hold labels."""
     runs = [run for run in _runs(free) if len(run) >= MIN_WIDE]
-    runs = [run for run in runs if not any(_is_measured(frame[name]) for name in run) and _share_labels(frame, run)]
+    runs = [run for run in runs if not any(_is_measured(frame[name]) for name in run)]
+    runs = [run for run in runs if _names_behaviours(run) or _share_labels(frame, run)]
     return max(runs, key=len, default=[])
+
+
+def _names_behaviours(run: list[str]) -> bool:
+    """Whether numbered columns are called behaviours, so that nothing else tells that they are."""
+    return plain(run[0]).startswith(("action ", "behavior ", "behaviour "))
 
 
 def _share_labels(frame: pd.DataFrame, names: list[str]) -> bool:
@@ -401,7 +438,9 @@ def _labelled_run(frame: pd.DataFrame, free: list[str]) -> list[str]:
 
 def _only_label(frame: pd.DataFrame, free: list[str]) -> str | None:
     """Return the one column of names that recur, or whose name ends as that of labels does."""
-    ends = [name for name in free if plain(name).split(" ")[-1] in ("behavior", "behaviour", "label", "state", "syllable")]
+    ends = [
+        name for name in free if plain(name).split(" ")[-1] in ("behavior", "behaviour", "label", "state", "syllable")
+    ]
     if len(ends) == 1:
         return ends[0]
     texts = []

@@ -25,6 +25,9 @@ JOIN = "|"
 TOGETHER = "+"
 """Between behaviours that are done at once."""
 
+UNSCORED = "\1"
+"""In place of the label of a frame that nobody scored; numpy would drop a zero."""
+
 MIN_REPEATS = 0.3
 """Share of rows with the label of the row before, at least which rows at equal steps are frames."""
 
@@ -101,7 +104,9 @@ class Table:
         label = [name for name in at.get("behaviour", []) if self.roles.layout != "rows of sequences"]
         first = sheet.frame.iloc[0]
         units = [first[name] for name in timed]
-        if units and all(re.fullmatch(r"\(?(s|ms|sec|seconds?|min|frames?|h|)\)?", text, re.IGNORECASE) for text in units):
+        if units and all(
+            re.fullmatch(r"\(?(s|ms|sec|seconds?|min|frames?|h|)\)?", text, re.IGNORECASE) for text in units
+        ):
             if any(units):
                 keep[0] = False
                 self.notes.append(f"line {sheet.lines[0]} holds units, and is not read as a row")
@@ -117,7 +122,9 @@ class Table:
             if loose.any():
                 keep &= ~loose
                 row = int(loose.argmax())
-                self.notes.append(f"{loose.sum():,} rows without behaviour, time and owner are left out ({sheet.place(row)})")
+                self.notes.append(
+                    f"{loose.sum():,} rows without behaviour, time and owner are left out ({sheet.place(row)})"
+                )
         view = next((name for name in sheet.frame if plain(name) == "view"), None)
         if self.roles.program and self.roles.program.name.startswith("Raven") and view:
             twice = sheet.frame.drop(columns=view).duplicated().to_numpy()
@@ -143,7 +150,9 @@ class Table:
 
     def _name_of_file(self) -> str:
         above = {plain(name): value for name, value in self.sheet.above.items()}
-        named = next((above[key] for key in ("observation id", "trial name", "observation", "video") if above.get(key)), "")
+        named = next(
+            (above[key] for key in ("observation id", "trial name", "observation", "video") if above.get(key)), ""
+        )
         return re.sub(r"\s+", " ", named) or self.sheet.stem
 
     def _keys(self, use: str, default: str) -> NDArray[Any]:
@@ -154,7 +163,9 @@ class Table:
         empty = keys == ""
         if use == "recording" and empty.any() and not empty.all():
             rows = np.flatnonzero(empty)
-            self.notes.append(f"{rows.size:,} rows have no recording ({self.place(int(rows[0]))}); they are called {default!r}")
+            self.notes.append(
+                f"{rows.size:,} rows have no recording ({self.place(int(rows[0]))}); they are called {default!r}"
+            )
         return np.where(empty, default, keys)
 
     def _subjects(self) -> NDArray[Any]:
@@ -167,7 +178,9 @@ class Table:
         codes, values = pd.factorize(keys)
         nobody = np.array([str(one).lower() in NO_SUBJECT for one in values] or [False])
         if nobody.any():
-            self.notes.append(f"{int(nobody[codes].sum()):,} rows are of {values[nobody.argmax()]!r}, taken as a subject")
+            self.notes.append(
+                f"{int(nobody[codes].sum()):,} rows are of {values[nobody.argmax()]!r}, taken as a subject"
+            )
         return keys
 
     def labels(self, texts: NDArray[Any]) -> NDArray[Any]:
@@ -230,7 +243,10 @@ class Table:
         block[order] = block_sorted
         frame = pd.DataFrame({"unit": unit, "block": block, "start": start, "label": labels})
         blocks = frame.groupby("block").agg(
-            unit=("unit", "first"), low=("start", "min"), high=("start", "max"), size=("start", "size"),
+            unit=("unit", "first"),
+            low=("start", "min"),
+            high=("start", "max"),
+            size=("start", "size"),
             kinds=("label", "nunique"),
         )
         blocks["before"] = blocks.groupby("unit")["high"].shift()
@@ -251,7 +267,9 @@ class Table:
         number = blocks.index.isin(chosen)
         session = pd.Series(number, index=blocks.index).groupby(blocks["unit"]).cumsum().add(1)
         numbers = session.reindex(block).to_numpy(np.int64)
-        self.recording = np.array([f"{name} ({n})" for name, n in zip(self.recording, numbers, strict=True)], dtype=object)
+        self.recording = np.array(
+            [f"{name} ({n})" for name, n in zip(self.recording, numbers, strict=True)], dtype=object
+        )
         self.first_notes.append(
             f"the time starts again {len(rows):,} times, first in {self.place(int(rows[0]))}: what follows is read as another"
             " recording"
@@ -295,9 +313,7 @@ class Table:
         fragment = np.cumsum(begin | missing) - 1
         events, fragment, rows = events[~missing].reset_index(drop=True), fragment[~missing], rows[~missing]
         fragment = np.unique(fragment, return_inverse=True)[1].astype(np.int64)
-        return Part(
-            self.sheet, self.roles, events, fragment, rows, self.unit, self.notes, self.first_notes, self.empty
-        )
+        return Part(self.sheet, self.roles, events, fragment, rows, self.unit, self.notes, self.first_notes, self.empty)
 
 
 def _whole_numbers(keys: NDArray[Any]) -> NDArray[Any]:
@@ -337,9 +353,7 @@ def rows_of_events(table: Table) -> Part:
     start = nothing if start_times is None else start_times.values
     stop = nothing if stop_times is None else stop_times.values
     if start_times and stop_times and start_times.kind != stop_times.kind and np.isfinite(stop).any():
-        table.problems.add(
-            f"`stop` must be {start_times.kind}, as `start` is, got {stop_times.kind}", [0], table.place
-        )
+        table.problems.add(f"`stop` must be {start_times.kind}, as `start` is, got {stop_times.kind}", [0], table.place)
     if start_times and start_times.kind == CLOCKS:
         start, stop = _past_midnight(table, start, stop)
     start, stop = _with_durations(table, start, stop, duration_times)
@@ -358,7 +372,9 @@ def rows_of_events(table: Table) -> Part:
         return _part_of_frames(table, _positions(table), labels)
     twice = _repeated_rows(table, start, stop)
     if twice.any():
-        table.first_notes.append(f"{twice.sum():,} rows are there twice, and read once ({table.place(int(twice.argmax()))})")
+        table.first_notes.append(
+            f"{twice.sum():,} rows are there twice, and read once ({table.place(int(twice.argmax()))})"
+        )
     rows = np.flatnonzero(~twice)
     start, stop = _exclusive(table, start, stop)
     part = table.part(rows, labels[rows], start[rows], stop[rows])
@@ -370,7 +386,7 @@ def _repeated_rows(table: Table, start: Floats, stop: Floats) -> NDArray[np.bool
     """Return which rows are, cell by cell, an earlier one, where they say when."""
     if np.isnan(start).all() or np.isnan(stop).all() or not (stop > start).any():
         return np.zeros(table.size, bool)
-    return table.frame.duplicated().to_numpy() & (stop > start)
+    return table.frame.assign(**{"\1": table.recording}).duplicated().to_numpy() & (stop > start)
 
 
 def _past_midnight(table: Table, start: Floats, stop: Floats) -> tuple[Floats, Floats]:
@@ -391,11 +407,13 @@ def _with_durations(table: Table, start: Floats, stop: Floats, duration: Times |
     seconds = duration.values
     negative = np.flatnonzero(seconds < 0)
     if negative.size:
-        table.problems.add(f"`duration` must be at least 0, got {seconds[negative[0]]:g}", negative.tolist(), table.place)
+        table.problems.add(
+            f"`duration` must be at least 0, got {seconds[negative[0]]:g}", negative.tolist(), table.place
+        )
     named, stops = "duration" not in table.roles.found, "stop" not in table.roles.found
     both = np.isfinite(seconds) & np.isfinite(stop) & np.isfinite(start)
     apart = both & (np.abs(stop - start - seconds) > 0.01 * (seconds + np.nanmedian(np.append(seconds, 1)) + 1e-9))
-    counts = named and not (stops and "stop" in table.roles.at) or (named and stops)
+    counts = (named and not (stops and "stop" in table.roles.at)) or (named and stops)
     if apart.any():
         which = "durations" if counts else "stops"
         table.first_notes.append(
@@ -428,7 +446,9 @@ def _exclusive(table: Table, start: Floats, stop: Floats) -> tuple[Floats, Float
     alike = len(gaps) >= 3 and gaps[0] > 0 and np.all(np.abs(gaps - gaps[0]) < 1e-6 * max(gaps[0], 1))
     if ends != "inclusive" and not (alike and "duration" not in table.roles.at):
         return start, stop
-    texts = np.concatenate([table.frame[name].to_numpy(object) for use in ("start", "stop") for name in table.roles.at.get(use, [])])
+    texts = np.concatenate(
+        [table.frame[name].to_numpy(object) for use in ("start", "stop") for name in table.roles.at.get(use, [])]
+    )
     step = smallest_unit(texts)
     if ends == "inclusive":
         return start, stop + step
@@ -457,14 +477,18 @@ def _notes_on_labels(table: Table, labels: NDArray[Any], part: Part, only_starts
                 " run one bout"
             )
     if only_starts:
-        notes.append("only starts are known: how long behaviours last is not (--ends next: each until the next one begins)")
+        notes.append(
+            "only starts are known: how long behaviours last is not (--ends next: each until the next one begins)"
+        )
     return notes
 
 
 def rows_of_starts_and_stops(table: Table) -> Part:
     """Read starts and stops that are rows of their own, and points; see `WORDS`."""
     if "start" not in table.roles.at:
-        table.problems.add("`columns.start` must name the time of each row where starts and stops are rows", [0], table.place)
+        table.problems.add(
+            "`columns.start` must name the time of each row where starts and stops are rows", [0], table.place
+        )
         table.problems.stop()
     times = table.times("start")
     assert times is not None
@@ -481,7 +505,10 @@ def rows_of_starts_and_stops(table: Table) -> Part:
         table.problems.stop()
     modifiers = [name for name in table.frame if plain(name).startswith("modifier") and name not in table.roles.used()]
     pairs = _pair(table.unit_codes(), texts, when, kinds)
-    if pairs.unpaired.size or _overlaps(table.unit_codes()[kinds == 0], when[kinds == 0], pairs.stop[kinds == 0]) > MAX_OVERLAP:
+    if (
+        pairs.unpaired.size
+        or _overlaps(table.unit_codes()[kinds == 0], when[kinds == 0], pairs.stop[kinds == 0]) > MAX_OVERLAP
+    ):
         table.split_sessions(when, texts)
         pairs = _pair(table.unit_codes(), texts, when, kinds)
     if modifiers and pairs.unpaired.size:
@@ -502,7 +529,11 @@ def rows_of_starts_and_stops(table: Table) -> Part:
         way = "--unpaired drop leaves such rows out, --unpaired open keeps starts whose stop is not known"
         table.problems.add(f"{texts[row]!r} has {what}; {way}", pairs.unpaired.tolist(), table.place)
     elif pairs.unpaired.size:
-        done = "left out" if table.options.unpaired == "drop" else "starts without a stop kept, stops without a start left out"
+        done = (
+            "left out"
+            if table.options.unpaired == "drop"
+            else "starts without a stop kept, stops without a start left out"
+        )
         table.first_notes.append(f"{pairs.unpaired.size:,} rows are starts or stops without the other: {done}")
     keep = kinds != 1
     if table.options.unpaired == "drop":
@@ -635,20 +666,25 @@ def _part_of_frames(table: Table, start: Floats, labels: NDArray[Any]) -> Part:
     first = np.flatnonzero(new)
     last = np.append(first[1:] - 1, len(order) - 1)
     rows = order[first]
-    words = table.frame[table.roles.at["behaviour"][0]].to_numpy(object)[rows] if len(table.roles.at["behaviour"]) == 1 else label[first]
+    words = (
+        table.frame[table.roles.at["behaviour"][0]].to_numpy(object)[rows]
+        if len(table.roles.at["behaviour"]) == 1
+        else label[first]
+    )
     # An empty cell says that nothing was done; a word for missing, that nobody knows.
     blank = (label[first] == "") & ((words == "") | (table.options.missing == "nothing"))
     start_of, stop_of = when[first], after[last]
     cut = hole[first]
-    lost = (label[first] == "") & ~blank
+    lost = ((label[first] == "") & ~blank) | (label[first] == UNSCORED)
     cut = cut | np.append(False, lost[:-1])
-    keep = label[first] != ""
+    keep = (label[first] != "") & ~lost
     carried = np.maximum.accumulate(np.where(cut, np.arange(len(first)), -1))
     previous = np.append(-1, np.flatnonzero(keep))
     cut_kept = carried[keep] > previous[:-1][: keep.sum()]
     table.notes.append(
         f"each row is a frame of {step:g} {table.unit or 'in the unit of the time'}: runs of one label are read as bouts"
-        if regular else "rows say when something changes: a label lasts until the next row"
+        if regular
+        else "rows say when something changes: a label lasts until the next row"
     )
     if blank.any():
         table.notes.append("frames with an empty cell were watched, and nothing was scored in them")
@@ -710,22 +746,10 @@ def columns_of_behaviours(table: Table) -> Part:
     labels = np.array(words, dtype=object)[inverse.ravel()]
     if several:
         some = next(word for word in words if TOGETHER in word)
-        table.first_notes.append(f"{several:,} of {table.size:,} rows have several behaviours, read as one, such as {some!r}")
-    part = _part_of_frames(table, start, np.where(unscored, "\0", labels))
-    return _without_unscored(part)
-
-
-def _without_unscored(part: Part) -> Part:
-    """Return a part without the bouts that stand for rows that nobody scored; a fragment begins after each."""
-    lost = part.events["behaviour"].eq("\0").to_numpy()
-    if not lost.any():
-        return part
-    begin = np.diff(part.fragment, prepend=-1) != 0
-    begin[1:] |= lost[:-1]
-    fragment = np.cumsum(begin | lost) - 1
-    part.events, part.rows = part.events[~lost].reset_index(drop=True), part.rows[~lost]
-    part.fragment = np.unique(fragment[~lost], return_inverse=True)[1].astype(np.int64)
-    return part
+        table.first_notes.append(
+            f"{several:,} of {table.size:,} rows have several behaviours, read as one, such as {some!r}"
+        )
+    return _part_of_frames(table, start, np.where(unscored, UNSCORED, labels))
 
 
 def _separate_behaviours(
@@ -733,15 +757,22 @@ def _separate_behaviours(
 ) -> Part:
     parts = []
     for i, name in enumerate(names):
-        labels = np.where(unscored, "\0", np.where(on[:, i], name, "")).astype(object)
+        labels = np.where(unscored, UNSCORED, np.where(on[:, i], name, "")).astype(object)
         parts.append(_part_of_frames(table, start, labels))
     table.notes = list(dict.fromkeys(table.notes))
-    events = pd.concat([_without_unscored(one).events for one in parts], ignore_index=True)
+    events = pd.concat([one.events for one in parts], ignore_index=True)
     rows = np.concatenate([one.rows for one in parts])
     order = events.assign(_row=rows).sort_values(["recording", "subject", "start"], kind="stable").index.to_numpy()
     events, rows = events.iloc[order].reset_index(drop=True), rows[order]
-    codes = pd.factorize(events["recording"] + "\0" + events["subject"])[0]
-    return replace(parts[0], events=events, fragment=codes.astype(np.int64), rows=rows, notes=table.notes)
+    spans = parts[0].spans
+    assert spans is not None
+    owners = pd.concat([spans, events], ignore_index=True)
+    unit = pd.factorize(owners["recording"] + "\0" + owners["subject"])[0]
+    width = float(owners["start"].max() - owners["start"].min()) + 1
+    place = unit * width + (owners["start"] - owners["start"].min()).to_numpy()
+    order = np.argsort(place[: len(spans)], kind="stable")
+    fragment = order[np.searchsorted(place[: len(spans)][order], place[len(spans) :], "right") - 1]
+    return replace(parts[0], events=events, fragment=fragment.astype(np.int64), rows=rows, notes=table.notes)
 
 
 def rows_of_sequences(table: Table) -> Part:
@@ -770,9 +801,13 @@ def rows_of_sequences(table: Table) -> Part:
     flat = labels[taken]
     table.unit = table.unit or "steps"
     if (flat == "").any():
-        table.notes.append(f"{int((flat == '').sum()):,} cells within sequences have no label: another fragment begins after each")
+        table.notes.append(
+            f"{int((flat == '').sum()):,} cells within sequences have no label: another fragment begins after each"
+        )
     part = table.part(rows.astype(np.int64), flat, steps.astype(np.float64), steps + 1.0)
-    again = (part.events["behaviour"].to_numpy()[1:] == part.events["behaviour"].to_numpy()[:-1]) & (np.diff(part.fragment) == 0)
+    again = (part.events["behaviour"].to_numpy()[1:] == part.events["behaviour"].to_numpy()[:-1]) & (
+        np.diff(part.fragment) == 0
+    )
     if len(again) and again.mean() > MIN_REPEATS:
         part.first_notes.append(
             f"{again.mean():.0%} of the cells repeat the one before: --merge_repeats true makes each run one bout"
@@ -812,7 +847,9 @@ def _strings_of_sequences(table: Table) -> Part | None:
     table.unit = "steps"
     if "recording" not in table.roles.at:
         by_subject = "subject" in table.roles.at and pd.Series(table.subject).is_unique
-        table.recording = table.subject if by_subject else np.array([str(i + 1) for i in range(table.size)], dtype=object)
+        table.recording = (
+            table.subject if by_subject else np.array([str(i + 1) for i in range(table.size)], dtype=object)
+        )
     rows: list[int] = []
     labels: list[str] = []
     lengths: list[float] = []

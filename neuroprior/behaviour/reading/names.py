@@ -3,7 +3,9 @@
 import re
 from typing import NamedTuple
 
-UNIT_IN_BRACKETS = re.compile(r"\s*[(\[](s|sec|secs|seconds|ms|msec|min|h|hh:mm:ss(.ms)?|frames?|hz|mg|mg/kg)[)\]]\s*$", re.I)
+UNIT_IN_BRACKETS = re.compile(
+    r"\s*[(\[](s|sec|secs|seconds|ms|msec|min|h|hh:mm:ss(.ms)?|frames?|hz|mg|mg/kg)[)\]]\s*$", re.I
+)
 UNIT_AT_END = re.compile(r"\s(s|sec|secs|seconds|sf|ms|hh mm ss ms|hh mm ss|ss msec|seconds since start)$")
 
 NAMES: dict[str, tuple[str, ...]] = {
@@ -42,6 +44,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "observer": (
         "observer", "observer id", "observer name", "coder", "coder id", "rater", "scorer", "annotator", "annotator id",
     ),
+    "context": ("context",),
     "factors": (
         "treatment", "condition", "genotype", "sex", "gender", "group", "drug", "dose", "strain", "age", "phase",
         "cohort", "line", "diet", "season", "day", "experimental group", "treatment group",
@@ -119,6 +122,10 @@ PROGRAMS: tuple[Program, ...] = (
              stop="end time", behaviour="annotation|species|call type|label|call|type|code|notes"),
 )  # fmt: skip
 """The first whose columns a file has all of is taken."""
+
+SIMBA = _program("SimBA, machine results", "", "columns of behaviours", "frames")
+DEEPETHOGRAM = _program("DeepEthogram, labels", "background", "columns of behaviours", "frames")
+"""Programs that are known by how their columns of zeros and ones are named."""
 
 WORDS = {
     "start": ("start", "state start", "begin", "began", "onset", "on", "started", "state begin", "beginn"),

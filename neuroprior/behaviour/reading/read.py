@@ -39,7 +39,9 @@ def read(paths: Any, columns: Columns | Mapping[str, Any] | None = None, **optio
 
     Example:
         >>> import pandas as pd
-        >>> table = pd.DataFrame({"animal": ["m1", "m1"], "behaviour": ["rest", "walk"], "start": [0, 5], "stop": [5, 7]})
+        >>> table = pd.DataFrame(
+        ...     {"animal": ["m1", "m1"], "behaviour": ["rest", "walk"], "start": [0, 5], "stop": [5, 7]}
+        ... )
         >>> read(table).events["stop"].tolist()
         [5.0, 7.0]
     """
@@ -110,7 +112,9 @@ def _read_sheet(sheet: Sheet, options: Options) -> Part:
         events = pd.DataFrame({name: [] for name in ("recording", "subject", "behaviour")}, dtype=object)
         events = events.assign(start=np.array([], float), stop=np.array([], float))
         nothing = np.array([], np.int64)
-        return Part(sheet, roles, events, nothing, nothing, first_notes=[f"{sheet.name} has no rows"], empty=[sheet.stem])
+        return Part(
+            sheet, roles, events, nothing, nothing, first_notes=[f"{sheet.name} has no rows"], empty=[sheet.stem]
+        )
     part = LAYOUTS[roles.layout](table)
     _check_observers(table, part, problems)
     _check_factors(part, problems)
@@ -121,19 +125,17 @@ def _read_sheet(sheet: Sheet, options: Options) -> Part:
 def _check_observers(table: Table, part: Part, problems: Problems) -> None:
     """Refuse events that two people scored, and of one subject bouts of one behaviour that overlap."""
     if "observer" in table.roles.at and "observer" in table.roles.found:
-        pairs = pd.DataFrame({"recording": table.recording, "observer": table.observer})
-        several = pairs.groupby("recording")["observer"].nunique()
+        pairs = pd.DataFrame({"recording": table.recording, "subject": table.subject, "observer": table.observer})
+        several = pairs.groupby(["recording", "subject"], sort=False)["observer"].nunique()
         name = table.roles.at["observer"][0]
         del table.roles.at["observer"]
         part.events = part.events.drop(columns="observer")
         if (several > 1).any():
-            row = int(np.flatnonzero(pairs["recording"] == several.idxmax())[0])
-            problems.add(
-                f"recording {several.idxmax()!r} was scored by {several.max()} observers; say --columns.observer {name!r}"
-                " to keep them apart, or read the file of one",
-                [row],
-                table.place,
-            )
+            recording, subject = several.index[int(several.to_numpy().argmax())]
+            row = int(np.flatnonzero((pairs["recording"] == recording) & (pairs["subject"] == subject))[0])
+            what = f"recording {recording!r} was scored by {several.max()} observers"
+            way = f"say --columns.observer {name!r} to keep them apart, or read the file of one"
+            problems.add(f"{what}; {way}", [row], table.place)
             return
     share, row = same_overlap(part.events)
     if share <= MAX_OVERLAP or table.options.overlaps == "keep":
@@ -169,7 +171,9 @@ def _separating_column(table: Table, part: Part) -> str | None:
     free = [name for name in table.frame if name not in used and 1 < table.frame[name].nunique() <= 20]
     likely = [name for name in free if plain(name) in NAMES["observer"]]
     for name in [*likely, *[one for one in free if one not in likely]]:
-        events = part.events.assign(subject=part.events["subject"] + JOIN + table.frame[name].to_numpy(object)[part.rows])
+        events = part.events.assign(
+            subject=part.events["subject"] + JOIN + table.frame[name].to_numpy(object)[part.rows]
+        )
         if same_overlap(events)[0] <= MAX_OVERLAP / 5:
             return str(name)
     return None
@@ -211,7 +215,11 @@ def _combine(parts: list[Part], notes: list[str], options: Options) -> Recording
     unowned = events["subject"].eq("").to_numpy()
     if unowned.any():
         events["subject"] = np.where(unowned, events["recording"], events["subject"])
-        whose = "each recording is taken as one subject" if unowned.all() else f"{unowned.sum():,} events are taken as of one"
+        whose = (
+            "each recording is taken as one subject"
+            if unowned.all()
+            else f"{unowned.sum():,} events are taken as of one"
+        )
         first.append(f"no subject is known: {whose} (--columns.subject)")
     share, row = same_overlap(events)
     if share > MAX_OVERLAP and options.overlaps == "error":
@@ -236,7 +244,9 @@ def _combine(parts: list[Part], notes: list[str], options: Options) -> Recording
     )
     spans = None
     if any(part.spans is not None for part in filled):
-        every = [Recordings(part.events, part.fragment).watched if part.spans is None else part.spans for part in filled]
+        every = [
+            Recordings(part.events, part.fragment).watched if part.spans is None else part.spans for part in filled
+        ]
         spans = pd.concat(every, ignore_index=True)
         spans["subject"] = spans["subject"].where(spans["subject"] != "", spans["recording"])
     recordings = Recordings(
@@ -266,4 +276,6 @@ def _keep_files_apart(parts: list[Part], notes: list[str]) -> None:
         again = part.events["recording"].isin(twice) & (part.events["subject"] == "")
         called = part.sheet.stem + " " + part.events["recording"].astype(str)
         part.events["recording"] = part.events["recording"].where(~again, called)
-    notes.append(f"{len(twice):,} names of recordings occur in several files, which are kept apart by the names of the files")
+    notes.append(
+        f"{len(twice):,} names of recordings occur in several files, which are kept apart by the names of the files"
+    )

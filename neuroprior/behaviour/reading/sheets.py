@@ -145,7 +145,9 @@ def _with_extra(label: str, read: Any, source: Any, **options: Any) -> Any:
     try:
         return read(source, **options)
     except ImportError as error:
-        raise ImportError(f"{label}: this kind of file needs more packages: pip install 'neuroprior[tables]'") from error
+        raise ImportError(
+            f"{label}: this kind of file needs more packages: pip install 'neuroprior[tables]'"
+        ) from error
     except Exception as error:  # the libraries raise a dozen kinds over damaged bytes
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise ReadingError(f"{label}: the file must be a whole table, got one that cannot be read ({reason})") from None
@@ -273,7 +275,9 @@ def _sheet_of_text(content: bytes, label: str, stem: str, wanted: Sequence[str])
 
 def _sheet_of_jwatcher(lines: list[str], first: int, label: str, stem: str) -> Sheet:
     """Return a focal data file of JWatcher: milliseconds and the key that was pressed; EOF is the end."""
-    pairs = [(number, _cells_of_line(line, ",")) for number, line in enumerate(lines[first - 1 :], first) if line.strip()]
+    pairs = [
+        (number, _cells_of_line(line, ",")) for number, line in enumerate(lines[first - 1 :], first) if line.strip()
+    ]
     rows = [(number, pair) for number, pair in pairs if len(pair) == 2 and pair[1] != "EOF"]
     frame = pd.DataFrame([pair for _, pair in rows], columns=["time (ms)", "behaviour"], dtype=object)
     notes = [f"{label} is read as a focal data file of JWatcher: when keys were pressed, in milliseconds"]
@@ -453,7 +457,9 @@ def _is_header(row: list[str], cells: pd.DataFrame, at: int) -> bool:
         return False
     if sum(plain(cell) in KNOWN_NAMES for cell in words) >= min(2, len(words)) and not all(map(_is_number, words)):
         return True
-    if any(re.fullmatch(r"-?\d+[.,]\d+|\d+:\d\d(:\d\d.*)?", word) for word in words) and not all(map(_is_number, words)):
+    if any(re.fullmatch(r"-?\d+[.,]\d+|\d+:\d\d(:\d\d.*)?", word) for word in words) and not all(
+        map(_is_number, words)
+    ):
         return False  # a time among words is data
     below = cells.iloc[at + 1 :]
     if not len(below):

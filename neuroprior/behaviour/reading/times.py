@@ -64,7 +64,9 @@ def read_times(
     commas = words[numbers.isna() & ~missing]
     if len(commas) and commas.str.fullmatch(r"-?\d*,\d+").all():
         if separator == "," and commas.str.fullmatch(THOUSANDS).all():
-            _complain(problems, place, codes, unique, ~missing & numbers.isna(), use, "a number without thousands' commas")
+            _complain(
+                problems, place, codes, unique, ~missing & numbers.isna(), use, "a number without thousands' commas"
+            )
             return Times(numbers.to_numpy(np.float64)[codes], NUMBERS)
         numbers = pd.to_numeric(words.where(~missing).str.replace(",", ".", regex=False), errors="coerce")
     good = numbers.notna() & np.isfinite(numbers.to_numpy(np.float64))
@@ -119,7 +121,9 @@ def _clock_seconds(
     values = values.where((seconds < 60) & (hours.isna() | (minutes < 60)))
     whole = days.astype(float).fillna(0)
     values = values.where(~with_days, 86400 * whole[0] + 3600 * whole[1] + 60 * whole[2] + whole[3])
-    _complain(problems, place, codes, unique, filled & values.isna(), use, "a time as h:m:s with minutes and seconds below 60")
+    _complain(
+        problems, place, codes, unique, filled & values.isna(), use, "a time as h:m:s with minutes and seconds below 60"
+    )
     found: Floats = values.to_numpy(np.float64)
     return found
 
@@ -147,7 +151,15 @@ def _date_seconds(
     )
     normal = normal.str.replace(r"(:\d+),(\d+)", r"\1.\2", regex=True)
     dates = pd.to_datetime(normal.where(filled), format="ISO8601", utc=True, errors="coerce")
-    _complain(problems, place, codes, unique, filled & dates.isna(), use, "a time: a number, h:m:s or a date as year-month-day")
+    _complain(
+        problems,
+        place,
+        codes,
+        unique,
+        filled & dates.isna(),
+        use,
+        "a time: a number, h:m:s or a date as year-month-day",
+    )
     found: Floats = (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(np.float64)
     return found
 
@@ -173,5 +185,3 @@ def smallest_unit(texts: NDArray[Any]) -> float:
     words = pd.Series(pd.unique(np.asarray(texts, dtype=object)), dtype=object)
     decimals = words.str.extract(r"[.,](\d+)$")[0].dropna().str.rstrip("0").str.len()
     return float(10.0 ** -(int(decimals.max()) if len(decimals) else 0))
-
-

@@ -11,12 +11,11 @@ from rich.console import Console
 from neuroprior.behaviour.report.document import show
 from neuroprior.behaviour.report.options import INPUTS, FitOptions, InputName, ModelName, ReadOptions
 from neuroprior.behaviour.report.plan_report import report
-from neuroprior.behaviour.tables import Columns, Missing
 from neuroprior.priors.ensembles.candidates import Effort
 
 
 def plans(
-    plans: str,
+    plans: list[str],
     priors: list[str] | None = None,
     test: str | None = None,
     folds: int | None = None,
@@ -26,22 +25,16 @@ def plans(
     skip: int = 0,
     effort: Effort = "standard",
     max_steps: int | None = None,
-    num_actions: int | None = None,
-    action_names: list[str] | None = None,
-    columns: Columns | None = None,
-    missing: Missing = "gap",
-    merge_repeats: bool = False,
-    max_gap: float | None = None,
     seed: int = 0,
     processes: int | None = None,
     dask: str | None = None,
     out: str = "runs/plans",
+    reading: ReadOptions = ReadOptions(),  # noqa: B008
 ) -> None:
     fits = FitOptions(models, tuple(inputs), modes, effort, folds, max_steps, seed, processes, dask)
-    reading = ReadOptions(columns, missing, merge_repeats, max_gap, num_actions, action_names)
     program, typed = Path(sys.argv[0]).name, sys.argv[1:]
     if typed[:1] not in (["plans"], ["report"]):  # called from Python
-        program, typed = "__main__.py", ["plans", plans]
+        program, typed = "__main__.py", ["plans", *plans]
     command = f"{program.replace('__main__.py', 'python -m eval')} {shlex.join(typed)}"
     document = report(plans, out=out, priors=priors, test=test, skip=skip, fits=fits, reading=reading, command=command)
     console = Console()
@@ -51,7 +44,7 @@ def plans(
 
 def _describe_options() -> str:
     """What the options are for, from the docstrings of the function and the classes that take them."""
-    entries = [entry for one in (report, FitOptions, ReadOptions) for entry in parse(inspect.getdoc(one) or "").params]
+    entries = [entry for one in (report, FitOptions) for entry in parse(inspect.getdoc(one) or "").params]
     lines = [f"    {entry.arg_name}: {' '.join((entry.description or '').split())}" for entry in entries]
     return "\n".join(["Print the report on a file of plans, and write it.", "", "Args:", *lines])
 

@@ -1,17 +1,17 @@
 """Options of a report on plans: how their file is read, and which models are fitted to them."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from neuroprior._checks import check_sizes
+from neuroprior.behaviour.reading import Options, read_recordings
 from neuroprior.behaviour.recorded_plans import RecordedPlans
-from neuroprior.behaviour.tables import Columns, Missing, read_events
 from neuroprior.plans import Plans, constant_context, read_plans
 from neuroprior.plans.columns import check_names
-from neuroprior.plans.io import MINARI, is_table
+from neuroprior.plans.io import MINARI
 from neuroprior.plans.io.npz import read_npz
 from neuroprior.priors.ensembles.candidates import Effort, check_effort
 
@@ -26,54 +26,77 @@ MAX_SEED = 2**50 - 1
 """Above it the seeds of single fits, a thousand times as large, would not be integers of 64 bits."""
 
 
+Files = str | Path | Sequence[str | Path]
+"""A file, a folder, a glob or several of them."""
+
+
 @dataclass(frozen=True)
-class ReadOptions:
-    """How a file of plans is read.
+class ReadOptions(Options):
+    """How files of behaviour are read as plans: the options of `neuroprior.behaviour.read`, and these.
 
     Attributes:
-        columns: which columns of a CSV file hold what: action, plan, context, group, condition, start, stop, duration,
-            event_type.
-        missing: what rows without a label do: a gap ends the plan; as label they count as an action; or error.
-        merge_repeats: take the same label in successive rows for one action, as in files with a row a frame.
-        max_gap: a longer pause between two actions ends the plan, too; in the unit of the starts.
-        num_actions: number of actions, where a file does not say.
-        action_names: names of the actions in the order of their numbers, where a file does not say.
+        max_gap: a longer pause between two behaviours ends a plan, too; in the unit of the times.
+        compare: the factor that is compared, such as the treatment, where recordings have several.
+        num_actions: number of actions, where they are numbers and the file does not say.
+        action_names: names of the actions in the order of their numbers, where the file does not say.
+        unknown: what behaviours do that are none of the names: an error, or a gap, at which a plan ends.
 
     Example:
-        >>> ReadOptions(columns={"action": "behaviour", "plan": "session"}, max_gap=10).missing
+        >>> ReadOptions(columns={"behaviour": "Behavior", "recording": "session"}, max_gap=10).missing
         'gap'
     """
 
-    columns: Columns | Mapping[str, Any] | None = None
-    missing: Missing = "gap"
-    merge_repeats: bool = False
     max_gap: float | None = None
+    compare: str | None = None
     num_actions: int | None = None
     action_names: Sequence[str] | None = None
+    unknown: Literal["error", "gap"] = "error"
 
-    def read(self, file: str) -> RecordedPlans:
-        """Reads the plans of a file: of a table with `read_events`, of others with `neuroprior.read_plans`.
+    def read(self, files: Files) -> RecordedPlans:
+        """Reads the plans of files: tables as recordings, `.npz`, `.jsonl` and Minari with `neuroprior.read_plans`.
 
-        What its reader warns of stands in the notes of the plans.
+        What a reader warns of stands in the notes of the plans.
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: an option or the file is wrong.
+            ValueError: an option or a file is wrong.
         """
-        if is_table(file):
-            plans = read_events(file, **vars(self))
+        file = files if isinstance(files, str | Path) else files[0] if len(files) == 1 else None
+        if file is None or is_recording(file):
+            recordings = read_recordings(files, self)
+            plans = recordings.plans(
+                max_gap=self.max_gap,
+                condition=self.compare,
+                num_actions=self.num_actions,
+                action_names=self.action_names,
+                unknown=self.unknown,
+            )
             return replace(plans, notes=(*plans.notes, *_feature_notes(plans)))
-        of_tables = ("columns", "missing", "merge_repeats", "max_gap")
-        if given := [name for name in of_tables if getattr(self, name) != DEFAULTS[name]]:
-            raise ValueError(f"{given[0]}: for CSV files only, not for {file}")
+        of_plans = ("num_actions", "action_names")
+        if given := [name for name, value in DEFAULTS.items() if name not in of_plans and getattr(self, name) != value]:
+            raise ValueError(f"`{given[0]}` must be left out for {file}, whose kind holds plans and no recordings")
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always", UserWarning)
-            plans = _read_recorded(file, self.num_actions, self.action_names)
+            plans = _read_recorded(str(file), self.num_actions, self.action_names)
         notes = [str(one.message).removeprefix(f"{file}: ") for one in warned]
         return replace(plans, notes=(*plans.notes, *notes, *_feature_notes(plans)))
 
 
-DEFAULTS = {field.name: field.default for field in fields(ReadOptions)}
+DEFAULTS = vars(ReadOptions())
+
+
+def is_recording(files: Files) -> bool:
+    """Whether files are read as recordings: all but plans in `.npz`, `.jsonl` and Minari's datasets."""
+    if not isinstance(files, str | Path):
+        return len(files) != 1 or is_recording(files[0])
+    return not str(files).startswith(MINARI) and Path(files).suffix.lower() not in (".npz", ".jsonl")
+
+
+def name_files(files: Files) -> str:
+    """Return the name of a file, or of the first of several and how many more there are."""
+    if isinstance(files, str | Path):
+        return Path(files).name
+    return f"{Path(files[0]).name} and {len(files) - 1} more" if len(files) > 1 else Path(files[0]).name
 
 
 def _read_recorded(file: str, num_actions: int | None, action_names: Sequence[str] | None) -> RecordedPlans:

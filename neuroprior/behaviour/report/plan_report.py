@@ -13,14 +13,14 @@ from neuroprior._jobs import Progress
 from neuroprior._threads import one_thread
 from neuroprior.behaviour.durations.past_durations import PastDurations
 from neuroprior.behaviour.recorded_plans import RecordedPlans
+from neuroprior.behaviour.recordings import Recordings
 from neuroprior.behaviour.report.document import Document, check_place, write_document
 from neuroprior.behaviour.report.fits import ACTIONS, CONTEXT, DURATIONS, LAGS, OF_FEATURES, Design, counted
-from neuroprior.behaviour.report.options import FitOptions, ReadOptions, check_choices
+from neuroprior.behaviour.report.options import Files, FitOptions, ReadOptions, check_choices, is_recording, name_files
 from neuroprior.behaviour.report.scores import Evaluation, cross_validation, evaluate, evaluate_saved, jobs
 from neuroprior.behaviour.report.sections import SECTIONS, describe
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
-from neuroprior.plans.io import is_table
 from neuroprior.plans.plans import AnyPlans
 from neuroprior.priors import Prior, load
 from neuroprior.priors.matching import learned_names, renumbered
@@ -34,11 +34,11 @@ FOLDS = 5
 
 
 def report(
-    plans: Plans | str | Path,
+    plans: Plans | Recordings | Files,
     *,
     out: str | Path | None = None,
     priors: Mapping[str, Prior] | Sequence[str] | None = None,
-    test: Plans | str | Path | None = None,
+    test: Plans | Recordings | Files | None = None,
     skip: int = 0,
     fits: FitOptions = FitOptions(),  # noqa: B008
     reading: ReadOptions | None = None,
@@ -48,7 +48,8 @@ def report(
     """Report on plans: which models predict them best, how far back they reach, what is typical of them.
 
     Args:
-        plans: executed plans, or their file: `.npz`, `.jsonl` or `.csv`, or `minari:` and the name of a Minari dataset.
+        plans: recordings, their files (see `neuroprior.behaviour.read`), or executed plans; a file of plans, `.npz`,
+            `.jsonl`, or `minari:` and the name of a Minari dataset.
         out: folder for `report.html`, `results.json`, tables as CSV, and the finished fits of a cross-validation, with
             which an interrupted one goes on; None: nothing is written.
         priors: score these fitted priors only, given by name or by their folders; the first is the reference.
@@ -76,10 +77,10 @@ def report(
     """
     check_choices("sections", sections, tuple(SECTIONS))
     check_count("skip", skip, 0)
-    if reading is not None and isinstance(plans, Plans) and not isinstance(test, str | Path):
+    if reading is not None and _in_memory(plans) and (test is None or _in_memory(test)):
         raise ValueError("`reading` must be left out for plans in memory.")
     reading = reading or ReadOptions()
-    file = "" if isinstance(plans, Plans) else str(plans)
+    file = "" if isinstance(plans, Plans | Recordings) else name_files(plans)
     if out is not None:
         check_place(Path(out), ["plans"] if "scores" in sections else [])  # before hours of work
     if priors is None:
@@ -96,7 +97,7 @@ def report(
 
 
 def _score_saved(
-    plans: Plans | str | Path, priors: Mapping[str, Prior] | Sequence[str], skip: int, reading: ReadOptions
+    plans: Plans | Recordings | Files, priors: Mapping[str, Prior] | Sequence[str], skip: int, reading: ReadOptions
 ) -> Evaluation:
     """Score fitted priors on plans, and note which of these they have learned from."""
     if isinstance(priors, Prior | str) or not priors or any(isinstance(one, Prior) for one in priors):
@@ -104,7 +105,7 @@ def _score_saved(
     loaded = dict(priors) if isinstance(priors, Mapping) else {folder: load(folder) for folder in priors}
     folders = [] if isinstance(priors, Mapping) else [*priors]
     past = {folder: one for folder in folders if (one := PastDurations.load(Path(folder))) is not None}
-    table = not isinstance(plans, Plans) and is_table(str(plans))
+    table = isinstance(plans, Recordings) or (not isinstance(plans, Plans) and is_recording(plans))
     if table and reading.action_names is None:
         reading = replace(reading, action_names=learned_names(next(iter(loaded.values()))))
     found = evaluate_saved(loaded, _read(plans, reading), skip, table, past)
@@ -115,8 +116,8 @@ def _score_saved(
 
 
 def _cross_validate(
-    plans: Plans | str | Path,
-    test: Plans | str | Path | None,
+    plans: Plans | Recordings | Files,
+    test: Plans | Recordings | Files | None,
     skip: int,
     fits: FitOptions,
     reading: ReadOptions,
@@ -129,7 +130,7 @@ def _cross_validate(
     whole, empty = _with_actions(plans, reading)
     other, cut = None, False
     if test is not None:
-        files = [Path(one).resolve() for one in (plans, test) if not isinstance(one, Plans)]
+        files = [Path(one).resolve() for one in (plans, test) if isinstance(one, str | Path)]
         if len(files) == 2 and files[0] == files[1]:
             raise ValueError(f"`test` must be other plans than those that are learned from, got {test}.")
         other, empty = _with_actions(test, reading)
@@ -139,7 +140,11 @@ def _cross_validate(
     if other is not None:
         other, cut = _in_parts(other)
     scored = learned if other is None else other
-    number = 1 if other is not None else _folds("plans" if isinstance(plans, Plans) else str(plans), learned, fits)
+    number = (
+        1
+        if other is not None
+        else _folds("plans" if isinstance(plans, Plans | Recordings) else name_files(plans), learned, fits)
+    )
     design = Design(number, fits.seed, skip, fits.max_steps, fits.effort, cut=cut)
     kinds: list[str] = [*fits.kinds]
     if with_lags:
@@ -160,7 +165,7 @@ def _cross_validate(
     settings: dict[str, Any] = {"models": ", ".join(kinds)} | found.settings
     settings |= {} if fits.modes is None else {"modes": sorted(set(fits.modes))}
     settings |= {"plans without actions, left out": empty} if empty else {}
-    settings |= {} if test is None else {"test": "plans" if isinstance(test, Plans) else str(test)}
+    settings |= {} if test is None else {"test": "plans" if isinstance(test, Plans | Recordings) else name_files(test)}
     return replace(found, plans=whole, settings=settings)
 
 
@@ -188,7 +193,7 @@ def _document(found: Evaluation, sections: Sequence[str], file: str, command: st
             made += [] if part is None else [part]
             progress.advance(name)
     return Document(
-        title=f"Plans in {Path(file).name}" if file else "Plans",
+        title=f"Plans in {file}" if file else "Plans",
         lead=" ".join([_lead(found), *(part.section.text[0] for part in made if part.section.title == "Conditions")]),
         sections=[part.section for part in made],
         frames={name: frame for part in made for name, frame in part.frames.items()},
@@ -221,15 +226,21 @@ def _finding(found: Evaluation) -> str:
     return f"{found.best.label} takes {fewest}{bits:.3f} {interval}; {found.too_few}."
 
 
-def _read(plans: Plans | str | Path, reading: ReadOptions) -> RecordedPlans:
+def _in_memory(plans: Plans | Recordings | Files) -> bool:
+    return isinstance(plans, Plans | Recordings)
+
+
+def _read(plans: Plans | Recordings | Files, reading: ReadOptions) -> RecordedPlans:
     """The plans, without an end symbol."""
-    plans = RecordedPlans.of(plans) if isinstance(plans, Plans) else reading.read(str(plans))
+    if isinstance(plans, Recordings):
+        plans = plans.plans(condition=reading.compare, max_gap=reading.max_gap)
+    plans = RecordedPlans.of(plans) if isinstance(plans, Plans) else reading.read(plans)
     return plans if plans.end is None else plans.without_end()
 
 
-def _with_actions(plans: Plans | str | Path, reading: ReadOptions) -> tuple[RecordedPlans, int]:
+def _with_actions(plans: Plans | Recordings | Files, reading: ReadOptions) -> tuple[RecordedPlans, int]:
     """The plans that have actions, and how many have none: these are of no use to models."""
-    read, file = _read(plans, reading), "plans" if isinstance(plans, Plans) else plans
+    read, file = _read(plans, reading), "plans" if isinstance(plans, Plans | Recordings) else name_files(plans)
     if read.num_actions > MOST_ACTIONS:
         raise ValueError(
             f"{file}: action numbers go up to {read.num_actions - 1}; number the actions from 0, or write names"

@@ -151,10 +151,10 @@ def test_options_of_files_reach_the_reader(tmp_path):
             at = t + (100 if t >= 6 else 0)
             rows.append(f"s{plan},{'' if (plan, t) == (0, 2) else 'abc'[action]},{at},{at + 1}")
     (tmp_path / "plans.csv").write_text("\n".join(rows) + "\n")
-    columns = {"plan": "session", "action": "behaviour", "start": "begin", "stop": "end"}
+    columns = {"recording": "session", "behaviour": "behaviour", "start": "begin", "stop": "end"}
 
     def facts(num_actions: int = 3, **options: Any) -> dict[str, Any]:
-        reading, priors = ReadOptions(columns, **options), {"none": UniformPrior(num_actions)}
+        reading, priors = ReadOptions(columns, ends="exclusive", **options), {"none": UniformPrior(num_actions)}
         return report(tmp_path / "plans.csv", priors=priors, reading=reading, sections=["file"]).results["file"]
 
     plain, gap, merged = facts(), facts(max_gap=5), facts(merge_repeats=True)

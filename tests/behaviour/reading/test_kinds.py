@@ -1,0 +1,349 @@
+"""Kinds of files that laboratories have, each small: what is right, or what the line of error says."""
+
+import gzip
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from neuroprior.behaviour import Recordings, read
+
+NAN = float("nan")
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Any:
+    """A function that reads a text as the file `name`."""
+
+    def read_text(text: str, columns: Any = None, name: str = "f.csv", **options: Any) -> Recordings:
+        (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+        return read(tmp_path / name, columns, **options)
+
+    return read_text
+
+
+def rows(recordings: Recordings) -> list[tuple[Any, ...]]:
+    """Subject, behaviour, start and stop of each event; None for an unknown time."""
+    events = recordings.events[["subject", "behaviour", "start", "stop"]].astype(object)
+    return [tuple(None if value != value else value for value in row) for row in events.itertuples(index=False)]
+
+
+def labels(recordings: Recordings) -> list[list[str]]:
+    """The behaviours of each subject."""
+    return [list(one) for _, one in recordings.events.groupby(["recording", "subject"], sort=False)["behaviour"]]
+
+
+@pytest.mark.parametrize("header", ["{}", "family{}", "t.{}", "V{}"])
+def test_a_header_of_numbers_is_none_of_the_sequences(header, study):
+    first = ",".join(header.format(i) for i in (1, 2, 3, 4))
+    found = study(f"{first}\n2,1,1,0\n1,1,2,2\n0,2,0,1\n")
+    assert labels(found) == [[*"2110"], [*"1122"], [*"0201"]]
+
+
+def test_a_column_that_counts_the_rows_is_no_action(study):
+    assert labels(study(",0,1,2\n0,2,1,1\n1,0,1,2\n2,1,1,0\n")) == [[*"211"], [*"012"], [*"110"]]
+    assert labels(study("animal\tbehaviour\n1\tm1\trest\n2\tm1\twalk\n")) == [["rest", "walk"]]  # R's names of rows
+
+
+def test_without_a_header_the_first_line_is_data(study):
+    assert labels(study("1,1,2,2\n2,2,2,1\n")) == [[*"1122"], [*"2221"]]
+    audacity = study("0.5\t1.25\tsong\n\\\t6441.0\t12296.5\n2.0\t2.0\tclick\n", name="bird 7.txt")
+    assert rows(audacity) == [("bird 7", "song", 0.5, 1.25), ("bird 7", "click", 2.0, 2.0)]
+
+
+BORIS = "Observation id,Duration,Subject,Behavior,Start (s),Stop (s)\no1,{},m1,rest,0,5\no1,{},m1,walk,5,7\no2,{},m2,rest,0,3\n"
+
+
+@pytest.mark.parametrize("length", ["", "600"])
+@pytest.mark.parametrize("columns", [None, {"start": "Start (s)", "stop": "Stop (s)", "behaviour": "Behavior"}])
+def test_what_is_named_beats_what_is_found(length, columns, study):
+    found = study(BORIS.format(*[length] * 3), columns)
+    assert rows(found) == [("m1", "rest", 0, 5), ("m1", "walk", 5, 7), ("m2", "rest", 0, 3)]
+    named = study(BORIS.format(6, 2, 4), {"duration": "Duration"})
+    assert [stop for *_, stop in rows(named)] == [6, 7, 4]
+    assert any("the durations count" in note for note in named.notes)
+
+
+def test_found_columns_that_hold_something_else_are_noted_and_can_be_left_out(study):
+    found = study("animal,behaviour,start\nm1,rest,yes\nm1,walk,no\n")
+    assert rows(found) == [("m1", "rest", None, None), ("m1", "walk", None, None)]
+    assert any("'start' holds no times" in note for note in found.notes)
+    varies = study("session,animal,behaviour,condition\n1,m1,rest,calm\n1,m1,walk,windy\n")
+    assert varies.factors == ()
+    assert any("'condition' varies" in note for note in varies.notes)
+    off = study("animal,behaviour,start\nm1,rest,1\nm1,walk,2\n", {"start": "none"})
+    assert rows(off) == [("m1", "rest", None, None), ("m1", "walk", None, None)]
+
+
+def test_an_empty_duration_beside_a_stop_is_known(study):
+    found = study(
+        "plan,action,start,stop,duration\no1,rest,0,100,\no1,walk,100,103,3\no1,peck,103,103,NA\no1,rest,103,,97\n"
+    )
+    assert [stop - start for *_, start, stop in rows(found)] == [100, 3, 0, 97]
+    assert len(found.plans(max_gap=10)) == 1
+
+
+@pytest.mark.parametrize(
+    ("start", "stop"),
+    [("START", "STOP"), ("State start", "State stop"), ("start", "complete"), ("begin", "end"), ("on", "off")],
+)
+def test_words_for_starts_and_stops(start, stop, study):
+    text = "subject,behavior,event_type,time\nc1,Lying,{0},0\nc1,Lying,{1},5.2\nc1,Walking,{0},5.2\nc1,Sniff,Point,7\nc1,Walking,{1},10\n"
+    assert rows(study(text.format(start, stop))) == [
+        ("c1", "Lying", 0, 5.2),
+        ("c1", "Walking", 5.2, 10),
+        ("c1", "Sniff", 7, 7),
+    ]
+    own = text.replace("event_type", "kind").format("in", "out")
+    told = study(own, {"event_type": "kind"}, words={"in": "start", "out": "stop"})
+    assert len(told.events) == 3
+    with pytest.raises(ValueError, match=r"line 2: `event_type` must be a word .* got 'in'.*--words in=start"):
+        study(own, {"event_type": "kind"})
+
+
+def test_of_two_starts_at_once_a_stop_closes_the_earlier(study):
+    tie = "plan,action,type,time\no,walk,START,0\no,walk,START,2\no,walk,STOP,2\no,walk,STOP,5\no,nod,START,7\no,nod,STOP,7\n"
+    assert rows(study(tie)) == [("o", "walk", 0, 2), ("o", "walk", 2, 5), ("o", "nod", 7, 7)]
+
+
+def test_unpaired_rows_are_listed_dropped_or_open(study):
+    text = "plan,action,type,time\no,walk,START,0\no,walk,STOP,2\no,rest,STOP,3\no,eat,START,3\no,eat,STOP,9\no,dig,START,9\n"
+    with pytest.raises(
+        ValueError, match=r"line 4: 'rest' has a stop without a start; --unpaired drop .*\(2 rows: 4, 7\)"
+    ):
+        study(text)
+    assert rows(study(text, unpaired="drop")) == [("o", "walk", 0, 2), ("o", "eat", 3, 9)]
+    kept = study(text, unpaired="open")
+    assert rows(kept) == [("o", "walk", 0, 2), ("o", "eat", 3, 9), ("o", "dig", 9, None)]
+    assert any(note.startswith("2 rows are starts or stops without the other") for note in kept.notes)
+
+
+def test_a_behaviour_of_several_columns(study):
+    text = (
+        "Observation id,Subject,Behavior,Modifier #1,Behavior type,Time\n"
+        "o1,f,walk,A,START,0\no1,f,walk,B,START,2\no1,f,walk,A,STOP,3\no1,f,walk,B,STOP,5\no1,f,rest,,START,5\no1,f,rest,,STOP,9\n"
+    )
+    due = [("f", "walk|A", 0, 3), ("f", "walk|B", 2, 5), ("f", "rest", 5, 9)]
+    assert rows(study(text, {"behaviour": ["Behavior", "Modifier #1"]})) == due
+    assert rows(study(text, {"behaviour": "Behavior,Modifier #1"})) == due
+    assert rows(study(text, {"behaviour": pd.Index(["Behavior", "Modifier #1"])})) == due
+    with pytest.raises(ValueError, match="--columns.behaviour 'Behavior,Modifier #1'"):
+        study(text)
+
+
+def test_an_empty_column_of_subjects_is_left_out(study):
+    text = (
+        "Observation id,Subject,Behavior,Behavior type,Time\no1,,sniff,START,5.5\no1,,sniff,STOP,7\no2,,groom,POINT,3\n"
+    )
+    found = study(text, {"subject": "Subject"})
+    assert rows(found) == [("o1", "sniff", 5.5, 7), ("o2", "groom", 3, 3)]
+    assert any("'Subject' is empty" in note for note in found.notes)
+
+
+def test_rows_of_commas_totals_and_units(study):
+    assert labels(study("animal,session,behaviour\nm1,1,rest\nm1,1,walk\n,,\n,,\n")) == [["rest", "walk"]]
+    total = study("animal,session,behaviour\nm1,1,rest\nm1,1,walk\nTotal,,\n")
+    assert labels(total) == [["rest", "walk"]]
+    assert any("line 4" in note for note in total.notes)
+    units = study("animal;behaviour;start\n;;s\nm1;rest;0,5\nm1;walk;1,5\n")
+    assert rows(units) == [("m1", "rest", 0.5, None), ("m1", "walk", 1.5, None)]
+    assert units.unit == "s"
+
+
+def test_negative_labels_stand_for_none(study):
+    found = study("animal,label\nm1,3\nm1,3\nm1,-1\nm1,2\nm2,0\nm2,-1\nm2,-1\nm2,1\n")
+    assert [[*map(str, one)] for one in labels(found)] == [["3", "3", "2"], ["0", "1"]]
+    assert len(found.plans()) == 4
+    kept = study("animal,label\nm1,3\nm1,-1\n", rename={"-1": "noise"})
+    assert labels(kept) == [["3", "noise"]]
+
+
+def test_contexts_that_are_measurements_are_features(study):
+    heading = study("animal,behaviour,heading\nm1,a,-90\nm1,b,0\nm1,a,90\nm2,b,45\n", {"context": "heading"}).plans()
+    assert heading.context.tolist() == [[[-90], [0], [90]], [[45], [0], [0]]]
+    mixed = study("animal,behaviour,zone\nm1,w,0\nm1,1,far\nm1,w,0\n", {"context": "zone"}).plans()
+    assert (mixed.action_names, mixed.context_names) == (("1", "w"), ("0", "far"))
+    assert mixed.context.tolist() == [[0, 1, 0]]
+
+
+def test_ends_that_are_inclusive(study):
+    text = "id,begin,end,state\n1,1,3,school\n1,4,4,out\n1,5,20,work\n2,1,10,school\n2,11,11,out\n2,12,20,work\n"
+    found = study(text)
+    assert [stop - start for *_, start, stop in rows(found)] == [3, 1, 16, 10, 1, 9]
+    assert "--ends exclusive" in found.notes[0]
+    assert [stop - start for *_, start, stop in rows(study(text, ends="exclusive"))] == [2, 0, 15, 9, 0, 8]
+
+
+def test_rows_of_frames_are_bouts_and_blank_frames_are_watched(study):
+    frames = [("", 5), ("groom", 7), ("", 3), ("dig", 4), ("groom", 6), ("", 2)]
+    cells = [label for label, count in frames for _ in range(count)]
+    text = "Time,Behaviour,animal\n" + "".join(f"{i / 25:.2f},{cell},m0\n" for i, cell in enumerate(cells))
+    found = study(text)
+    np.testing.assert_allclose(found.events["start"], [0.2, 0.6, 0.76])
+    np.testing.assert_allclose(found.events["stop"], [0.48, 0.76, 1.0])
+    assert found.watched[["start", "stop"]].to_numpy().tolist() == [[0.0, pytest.approx(1.08)]]
+    assert len(found.plans()) == 1
+
+
+def test_columns_of_behaviours(study):
+    on = [(1, 0, 0)] * 4 + [(0, 1, 0)] * 3 + [(0, 1, 1)] * 2 + [(0, 0, 1)] * 5 + [(-1, -1, -1)] * 2 + [(1, 0, 0)]
+    text = ",background,attack,sniff\n" + "".join(f"{i},{','.join(map(str, one))}\n" for i, one in enumerate(on))
+    found = study(text)
+    due = [("f", "background", 0, 4), ("f", "attack", 4, 9), ("f", "sniff", 7, 14), ("f", "background", 16, 17)]
+    assert rows(found) == due
+    assert found.sources[0].program == "DeepEthogram, labels"
+    assert found.watched[["start", "stop"]].to_numpy().tolist() == [[0, 14], [16, 17]]
+    joined = study(text, overlaps="join")
+    assert labels(joined) == [["background", "attack", "attack+sniff", "sniff", "background"]]
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("f.csv", "animal|behaviour\nm1|rest\nm1|walk é\n".encode("utf-16")),
+        ("f.csv", "animal\tbehaviour\nm1\trest\nm1\twalk é\n".encode("utf-16-le")),
+        ("f.txt", "animal;behaviour\r\nm1;rest\r\nm1;walk é\r\n".encode("cp1252")),
+        ("f.csv.gz", gzip.compress("animal,behaviour\nm1,rest\nm1,walk é".encode("utf-8-sig"))),
+        ("f.tsv", 'sep=;\nanimal;behaviour\nm1;rest\nm1;"walk é"\n'.encode()),
+    ],
+)
+def test_encodings_and_separators(name, content, study):
+    assert labels(study(content, name=name)) == [["rest", "walk é"]]
+
+
+@pytest.mark.parametrize("suffix", [".xlsx", ".parquet", ".feather"])
+def test_workbooks_and_binary_tables(suffix, tmp_path):
+    pytest.importorskip("pyarrow")
+    frame = pd.DataFrame(
+        {"animal": ["m1", "m1", "m2"], "behaviour": ["rest", "walk", "rest"], "start": [0, 1.5, 2], "stop": [1.5, 2, 9]}
+    )
+    if suffix == ".xlsx":
+        pytest.importorskip("openpyxl")
+        pytest.importorskip("python_calamine")
+        with pd.ExcelWriter(tmp_path / "f.xlsx") as book:
+            frame.to_excel(book, sheet_name="events", index=False)
+            pd.DataFrame({"code": ["r"], "meaning": ["rest"]}).to_excel(book, sheet_name="ethogram", index=False)
+    else:
+        (frame.to_parquet if suffix == ".parquet" else frame.to_feather)(tmp_path / f"f{suffix}")
+    found = read(tmp_path / f"f{suffix}")
+    assert rows(found) == [("m1", "rest", 0, 1.5), ("m1", "walk", 1.5, 2), ("m2", "rest", 2, 9)]
+    assert (suffix == ".xlsx") == any("ethogram" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"PK\x03\x04\x14\x00 cut off", "zip archive or workbook"),
+        (b"\x1f\x8b\x08\x00 cut", "gzip"),
+        (b"<!DOCTYPE html><html></html>", "web page"),
+        (b"\x00\x01\x02\x03\x00\x00\x00\x07\x08\x09\x10", "binary"),
+        (b"  \n", "empty file"),
+        (b"start,stop\n0,1\n2,3\n", "--columns.behaviour"),
+        (
+            b"animal,behaviour,start\nm1,a,soon\nm1,b,2\nm1,a,3\nm1,b,late\nm1,a,7\n",
+            "line 2: `start` must be a number, got 'soon' (2 rows: 2, 5)",
+        ),
+        (b"animal,behaviour,start,stop\nm1,a,1,0\nm1,b,2,3\n", "line 2: `stop` must not be before `start`"),
+        (b"animal,behaviour,start\nm1,a,01/02/2024\nm1,b,03/04/2024\n", "--day_first"),
+        (b"animal,behaviour,start\nm1,a,10:20\nm1,b,11:30\n", "h:m:s"),
+        (b"animal,behaviour,start\nm1,a,1,9\nm1,b,2\nm1,b,3\n", "line 2: a row must have 3 cells"),
+    ],
+)
+def test_what_cannot_be_read_is_one_line(content, words, study):
+    with pytest.raises(ValueError) as error:
+        study(content)
+    assert words in str(error.value)
+    assert "f.csv" in str(error.value)
+
+
+def test_the_header_is_the_line_with_most_of_the_names(study):
+    text = (
+        "Observation id,o1,,\n,,,\nMedia file,a.mp4,,\n\nTime,Subject,Behavior,Status\n3.3,s1,s,START\n7.7,s1,s,STOP\n"
+    )
+    for columns in (None, {"behaviour": "Behavior", "recording": "Observation id"}):
+        found = study(text, columns)
+        assert rows(found) == [("s1", "s", 3.3, 7.7)]
+        assert found.events["recording"].tolist() == ["o1"]
+
+
+def test_labels_that_are_unknown_to_a_prior_are_an_error_or_gaps(study):
+    found = study("animal,behaviour\nm1,a\nm1,b\nm1,new\nm1,a\nm2,b\n")
+    with pytest.raises(ValueError, match=r"'new' is none of a, b \(1 events\).*--unknown gap"):
+        found.plans(action_names=["a", "b"])
+    plans = found.plans(action_names=["a", "b"], unknown="gap")
+    assert plans.actions.tolist() == [[0, 1], [0, 0], [1, 0]]
+    assert plans.lengths.tolist() == [2, 1, 1]
+
+
+def test_times_of_day_go_on_over_midnight(study):
+    text = "animal,behaviour,start,stop\nm1,rest,23:58:12,23:59:23.5\nm1,feed,23:59:23.5,00:00:22\nm1,rest,00:00:22,00:01:32\n"
+    found = study(text)
+    np.testing.assert_allclose(found.events["start"], [86292, 86363.5, 86422])
+    np.testing.assert_allclose(found.events["stop"] - found.events["start"], [71.5, 58.5, 70])
+    assert "midnight" in found.notes[0]
+
+
+def test_dates_with_the_day_first(study):
+    found = study(
+        "animal,behaviour,start\nm1,a,31/12/2023 23:59:58\nm1,b,01/01/2024 00:00:03\nm1,a,02/01/2024 00:00:03\n"
+    )
+    np.testing.assert_allclose(np.diff(found.events["start"]), [5, 86400])
+    told = study("animal,behaviour,start\nm1,a,01/02/2024\nm1,b,02/02/2024\n", day_first=True)
+    assert np.diff(told.events["start"]).tolist() == [86400]
+
+
+def test_sessions_without_a_name_are_kept_apart(study):
+    one = "".join(f"m1,{'abc'[i % 3]},{i * 2},{i * 2 + 2}\n" for i in range(6))
+    found = study("animal,behaviour,start,stop\n" + one + one)
+    assert labels(found) == [[*"abcabc"], [*"abcabc"]]
+    assert "starts again" in found.notes[0]
+    by_behaviour = sorted(one.splitlines(), key=lambda line: line.split(",")[1])  # merely in another order
+    assert labels(study("animal,behaviour,start,stop\n" + "\n".join(by_behaviour) + "\n")) == [[*"abcabc"]]
+
+
+def test_two_observers_of_one_session_are_refused_or_kept_apart(study):
+    anna = [("walk", 0, 4), ("rest", 4, 9), ("walk", 9, 14)]
+    text = "session,animal,behaviour,start,stop,scored by\n"
+    text += "".join(
+        f"s1,m1,{b},{start},{stop},Anna\ns1,m1,{b},{start + 0.2},{stop + 0.3},Ben\n" for b, start, stop in anna
+    )
+    with pytest.raises(
+        ValueError, match="overlap another of the same subject and behaviour.*'scored by' keeps them apart"
+    ):
+        study(text)
+    with pytest.raises(ValueError, match="overlap another"):
+        study(text, {"observer": "none"})
+    found = study(text, {"observer": "scored by"})
+    assert found.events["observer"].value_counts().to_dict() == {"Anna": 3, "Ben": 3}
+    assert found.plans().actions.tolist() == [[1, 0, 1]]
+    kappa = found.agreement().set_index("behaviour")["kappa"]
+    # Of the 13.8 s that both watched, 4 and 3.8 and 5 and 4.8 s are walk in the eyes of both: counted by hand.
+    both, a, b, time = 3.8 + 4.8, 3.8 + 5, 4.1 + 4.8, 13.8
+    agree, chance = (both + time - a - b + both) / time, a / time * b / time + (1 - a / time) * (1 - b / time)
+    assert kappa["walk"] == pytest.approx((agree - chance) / (1 - chance))
+
+
+def test_several_files_are_one_study(tmp_path):
+    for name, start in (("cage2_day1", 3), ("cage1_day1", 0)):
+        (tmp_path / f"{name}.csv").write_text(
+            f"subject;behaviour;start;stop;treatment\nm1;rest;{start},5;5;drug\nm2;walk;5;7;none\n"
+        )
+    (tmp_path / "empty.csv").write_text("subject;behaviour;start;stop;treatment\n")
+    found = read(tmp_path)
+    assert sorted(set(found.events["recording"])) == ["cage1_day1", "cage2_day1"]
+    assert found.empty == ("empty",)
+    assert found.num_recordings == 5
+    pd.testing.assert_frame_equal(read(str(tmp_path / "*.csv")).events, found.events)
+    assert read([tmp_path / "cage1_day1.csv"]).num_recordings == 2
+
+
+def test_bad_options_are_one_line(study):
+    for options, words in (
+        ({"missing": "drop"}, "missing"),
+        ({"from_": 3, "to": 1}, "from_"),
+        ({"drop": ["x"]}, "'x'"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            study("animal,behaviour,start\nm1,a,0\nm1,b,2\n", **options)
