@@ -146,7 +146,7 @@ def plans_of_events(
     else:
         names = tuple(sorted(labels)) if names is None else names
         count, shown = len(names), ", ".join(names)
-        actions = pd.Index(list(names)).get_indexer(behaviour).astype(np.int64)
+        actions = pd.Index(list(names)).get_indexer(pd.Index(behaviour)).astype(np.int64)
         outside = actions < 0
     if outside.any() and unknown == "error":
         label, row = behaviour[outside][0], events.iloc[int(outside.argmax())]

@@ -42,9 +42,9 @@ class Recordings:
     """Events in real time.
 
     Attributes:
-        events: a pandas frame with the columns `recording, subject, behaviour` (texts), `start, stop` (float64, NaN where
-            unknown), `observer` where more than one scored, and one for each factor and context (texts); the events of a
-            recording and subject stand together, in the order of time.
+        events: a pandas frame with the columns `recording, subject, behaviour` (texts), `start, stop` (float64, NaN
+            where unknown), `observer` where more than one scored, and one for each factor and context (texts); the
+            events of a recording and subject stand together, in the order of time.
         fragment: int `[events]`, from 0: between two fragments nobody watched, or nothing is known.
         unit: of the times: "s", "ms", "frames", "steps", or "" where it is not known.
         notes: what was noticed, a line each, the weighty ones first.
@@ -67,7 +67,8 @@ class Recordings:
     def __repr__(self) -> str:
         """The numbers of what there is."""
         return (
-            f"Recordings({len(self.events):,} events, {self.num_recordings:,} recordings, {self.events['subject'].nunique():,}"
+            f"Recordings({len(self.events):,} events, {self.num_recordings:,} recordings,"
+            f" {self.events['subject'].nunique():,}"
             f" subjects, {self.events['behaviour'].nunique():,} behaviours)"
         )
 
@@ -78,7 +79,8 @@ class Recordings:
 
     @property
     def watched(self) -> pd.DataFrame:
-        """When each recording was watched: a frame with the columns `recording, subject, start, stop`, a row a fragment.
+        """When each recording was watched: a frame with the columns `recording, subject, start, stop`, a row a
+        fragment.
 
         A fragment is from the first frame to the last where rows are frames; else from the start of its first event to
         the last stop in it (or the last start, where no stop is known).
@@ -188,8 +190,8 @@ class Recordings:
         Each moment that both watched is a case; a behaviour is done in it or not.
 
         Returns:
-            A frame with the columns `first, second, behaviour, kappa, agreement, time`: the share of the time in which both
-            say the same, and the time that both watched.
+            A frame with the columns `first, second, behaviour, kappa, agreement, time`: the share of the time in
+            which both say the same, and the time that both watched.
 
         Raises:
             ValueError: fewer than two observers, or unknown stops.
@@ -217,7 +219,8 @@ class Recordings:
         return total.assign(kappa=kappa, agreement=same)[["kappa", "agreement", "time"]].reset_index()
 
     def of_one_observer(self) -> "Recordings":
-        """Return the recordings with one observer for each recording and subject: who scored most events of the study."""
+        """Return the recordings with one observer for each recording and subject: who scored most events of"
+        " the study."""
         if "observer" not in self.events:
             return self
         rank = self.events["observer"].value_counts()
@@ -281,11 +284,11 @@ def _both_done(pair: pd.DataFrame, first: str, second: str) -> list[tuple[str, s
         return []
     edges = np.unique(np.clip(np.concatenate([pair["start"], pair["stop"], [low, high]]), low, high))
     middle, width = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
-    rows = []
+    rows: list[tuple[str, str, str, float, float, float, float]] = []
     for behaviour in pd.unique(pair["behaviour"]):
         done = [_is_done(one[one["behaviour"] == behaviour], middle) for one in (mine, yours)]
-        times = [float(width[one].sum()) for one in (done[0] & done[1], done[0], done[1])]
-        rows.append((first, second, str(behaviour), *times, float(high - low)))
+        both, one, other = (float(width[some].sum()) for some in (done[0] & done[1], done[0], done[1]))
+        rows.append((first, second, str(behaviour), both, one, other, float(high - low)))
     return rows
 
 

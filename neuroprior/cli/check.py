@@ -44,7 +44,8 @@ def describe(recordings: Recordings) -> Iterator[str | Table]:
     unit = recordings.unit or "units"
     time = float((watched["stop"] - watched["start"]).sum())
     yield (
-        f"{len(events):,} events of {events['behaviour'].nunique():,} behaviours, {recordings.num_recordings:,} recordings"
+        f"{len(events):,} events of {events['behaviour'].nunique():,} behaviours, {recordings.num_recordings:,}"
+        " recordings"
         f" of {events['subject'].nunique():,} subjects"
     )
     gaps = len(watched) - len(watched[["recording", "subject"]].drop_duplicates())

@@ -315,11 +315,11 @@ def _choose_behaviour(sheet: Sheet, roles: Roles, is_range: bool, closed: set[st
     if roles.at.get("behaviour"):
         names = roles.at["behaviour"]
         if "behaviour" not in roles.found and len(names) > 1:
-            wide = is_range or _is_numbered(names)
-            indicators = all(_is_indicator(frame[name]) for name in names)
-            if indicators and not (wide and _is_numbered(names)):
+            in_range = is_range or _is_numbered(names)
+            zeros = all(_is_indicator(frame[name]) for name in names)
+            if zeros and not (in_range and _is_numbered(names)):
                 roles.layout = "columns of behaviours"
-            elif wide or (len(names) >= MIN_WIDE and "start" not in roles.at and _share_labels(frame, names)):
+            elif in_range or (len(names) >= MIN_WIDE and "start" not in roles.at and _share_labels(frame, names)):
                 roles.layout = "rows of sequences"
         return
     free = [name for name in frame if name not in roles.used()]
@@ -373,7 +373,7 @@ def _is_measured(column: "pd.Series[Any]") -> bool:
     return different > max(300, 0.5 * len(numbers)) and len(numbers) > 600
 
 
-def _indicator_columns(frame: pd.DataFrame, free: list[str]) -> list[str]:
+def _indicator_columns(frame: Any, free: list[str]) -> list[str]:
     """Return the columns of zeros and ones that are behaviours; with SimBA's probabilities, those that have one."""
     names = [name for name in free if _is_indicator(frame[name]) and not NO_BEHAVIOURS.match(name)]
     chosen = [name for name in names if f"Probability_{name}" in frame.columns]
@@ -401,7 +401,7 @@ def _runs(names: list[str]) -> list[list[str]]:
     return runs
 
 
-def _numbered_run(frame: pd.DataFrame, free: list[str]) -> list[str]:
+def _numbered_run(frame: Any, free: list[str]) -> list[str]:
     """Return the longest run of numbered columns that hold labels."""
     runs = [run for run in _runs(free) if len(run) >= MIN_WIDE]
     runs = [run for run in runs if not any(_is_measured(frame[name]) for name in run)]
@@ -414,7 +414,7 @@ def _names_behaviours(run: list[str]) -> bool:
     return plain(run[0]).startswith(("action ", "behavior ", "behaviour "))
 
 
-def _share_labels(frame: pd.DataFrame, names: list[str]) -> bool:
+def _share_labels(frame: Any, names: list[str]) -> bool:
     """Whether columns hold the same labels: most of those of each column occur in others."""
     sets = [set(pd.unique(frame[name])) - {""} for name in names]
     sets = [one for one in sets if one]
@@ -424,7 +424,7 @@ def _share_labels(frame: pd.DataFrame, names: list[str]) -> bool:
     return float(np.mean(whole)) > 0.5
 
 
-def _labelled_run(frame: pd.DataFrame, free: list[str]) -> list[str]:
+def _labelled_run(frame: Any, free: list[str]) -> list[str]:
     """Return the longest run of neighbouring columns that share names (no numbers) as labels."""
     best: list[str] = []
     run: list[str] = []
@@ -436,7 +436,7 @@ def _labelled_run(frame: pd.DataFrame, free: list[str]) -> list[str]:
     return best if len(best) >= MIN_WIDE else []
 
 
-def _only_label(frame: pd.DataFrame, free: list[str]) -> str | None:
+def _only_label(frame: Any, free: list[str]) -> str | None:
     """Return the one column of names that recur, or whose name ends as that of labels does."""
     ends = [
         name for name in free if plain(name).split(" ")[-1] in ("behavior", "behaviour", "label", "state", "syllable")

@@ -7,11 +7,12 @@ import numpy as np
 import pandas as pd
 
 from neuroprior.behaviour.reading.columns import Columns, find_roles
-from neuroprior.behaviour.reading.layouts import JOIN, LAYOUTS, MAX_OVERLAP, Part, Table
+from neuroprior.behaviour.reading.layouts import LAYOUTS
 from neuroprior.behaviour.reading.names import NAMES, plain
 from neuroprior.behaviour.reading.options import Options
 from neuroprior.behaviour.reading.problems import Problems, ReadingError
 from neuroprior.behaviour.reading.sheets import Sheet, find_files, read_sheets, sheet_of_frame
+from neuroprior.behaviour.reading.table import JOIN, MAX_OVERLAP, Part, Table
 from neuroprior.behaviour.recordings import Recordings, Source
 
 KEYS = ("recording", "subject", "observer")
@@ -25,8 +26,9 @@ def read(paths: Any, columns: Columns | Mapping[str, Any] | None = None, **optio
     options.
 
     Args:
-        paths: a file, a folder, a glob, a pandas frame, or a list of these. Text (any separator, UTF-8, UTF-16, Windows-1252),
-            also in .gz and .zip; .xlsx, .xls, .ods, .parquet, .feather and .h5 need `pip install 'neuroprior[tables]'`.
+        paths: a file, a folder, a glob, a pandas frame, or a list of these. Text (any separator, UTF-8, UTF-16,
+            Windows-1252), also in .gz and .zip; .xlsx, .xls, .ods, .parquet, .feather and .h5 need `pip install
+            'neuroprior[tables]'`.
         columns: which columns hold what: `Columns`, or a dict of some of its names.
         options: how they are read, see `neuroprior.behaviour.reading.Options`.
 
@@ -192,7 +194,7 @@ def _check_factors(part: Part, problems: Problems) -> None:
             part.notes.append(f"the column {name!r} varies within recordings, and is not used as a factor")
         else:
             value = part.events[name].iloc[other[0]]
-            what = f"the factor {name!r} must be one for each recording of a subject, got {value!r} beside {own.iloc[other[0]]!r}"
+            what = f"the factor {name!r} must not vary within a recording, got {value!r} beside {own.iloc[other[0]]!r}"
             problems.add(what, part.rows[other].tolist(), part.sheet.place)
 
 
@@ -227,7 +229,8 @@ def _combine(parts: list[Part], notes: list[str], options: Options) -> Recording
         raise ReadingError(
             [
                 f"{share:.0%} of the bouts overlap another of the same subject and behaviour across files, such as"
-                f" {event['behaviour']!r} of {event['subject']!r}; name the files of one observer, or say --overlaps keep"
+                f" {event['behaviour']!r} of {event['subject']!r}; name the files of one observer, or say"
+                " --overlaps keep"
             ]
         )
     said = list(dict.fromkeys([*first, *notes, *[note for part in parts for note in part.notes if note]]))

@@ -11,6 +11,7 @@ import zipfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -44,8 +45,8 @@ class Sheet:
     Attributes:
         name: of the file, and of the sheet in it; for messages.
         stem: what the recording is called where no column says it.
-        frame: texts without space at their ends, "" where a cell is empty; the columns have different names.
-        lines: int `[rows]`, the number of each row in the file.
+        frame: a pandas frame of texts without space at their ends, "" where a cell is empty; the columns have
+        different names. lines: int `[rows]`, the number of each row in the file.
         header: whether the file names its columns; else they are numbered from 1.
         above: what stands above the header as "name, value" lines, by name.
         separator: between cells; "" where the file is no text.
@@ -55,7 +56,7 @@ class Sheet:
 
     name: str
     stem: str
-    frame: pd.DataFrame
+    frame: Any
     lines: NDArray[np.int64]
     header: bool = True
     above: dict[str, str] = field(default_factory=dict)
@@ -346,7 +347,7 @@ def _separator(lines: Sequence[str], wanted: Sequence[str]) -> str:
 
 
 def _sheet_of_cells(
-    cells: pd.DataFrame, lines: NDArray[Any], name: str, stem: str, separator: str, wanted: Sequence[str]
+    cells: Any, lines: NDArray[Any], name: str, stem: str, separator: str, wanted: Sequence[str]
 ) -> Sheet:
     """Return a sheet of rows of cells, with the header found and what stands above it taken out."""
     filled = cells.ne("").any(axis=1).to_numpy()
@@ -357,7 +358,7 @@ def _sheet_of_cells(
     if comment.any() and not comment.all():
         cells, lines = cells[~comment].reset_index(drop=True), lines[~comment]
     sheet = Sheet(name, stem, cells, lines, separator=separator)
-    top = [row for row in cells.head(MAX_LINES_ABOVE).to_numpy(dtype=object).tolist()]
+    top = cells.head(MAX_LINES_ABOVE).to_numpy(dtype=object).tolist()
     at, header = _find_header(top, cells, wanted)
     sheet.above = {row[0].rstrip(":"): row[1] for row in top[:at] if row[0] and len(row) > 1}
     if at:
@@ -401,7 +402,7 @@ def _distinct(names: Iterable[str]) -> list[str]:
     return found
 
 
-def _find_header(top: list[list[str]], cells: pd.DataFrame, wanted: Sequence[str]) -> tuple[int, list[str] | None]:
+def _find_header(top: list[list[str]], cells: Any, wanted: Sequence[str]) -> tuple[int, list[str] | None]:
     """Return the position of the header and its cells; None for the cells where the file has none.
 
     The line with most of the names that the user gave; else that of a program that is known; else the line that the
@@ -450,7 +451,7 @@ def _ethovision_header(top: list[list[str]], count: int) -> int:
     )
 
 
-def _is_header(row: list[str], cells: pd.DataFrame, at: int) -> bool:
+def _is_header(row: list[str], cells: Any, at: int) -> bool:
     """Whether a line names columns: by words that are known, by its numbers, or since it is unlike the rows below."""
     words = [cell for cell in row if cell]
     if not words or len(set(words)) < len(words):
@@ -466,7 +467,7 @@ def _is_header(row: list[str], cells: pd.DataFrame, at: int) -> bool:
         return not any(map(_is_number, words))
     if all(map(_is_number, words)):
         numbers = [float(word.replace(",", ".")) for word in words]
-        counts = len(numbers) > 2 and all(b - a == 1 for a, b in zip(numbers, numbers[1:], strict=False))
+        counts = len(numbers) > 2 and all(b - a == 1 for a, b in pairwise(numbers))
         return counts and not _counts(below.iloc[0]) and (not row[0] or numbers[0] in (0, 1) or len(numbers) > 5)
     numbered = [STEM_AND_NUMBER.fullmatch(word) for word in words]
     stems = Counter(match[1] for match in numbered if match)
@@ -486,7 +487,7 @@ def _counts(row: "pd.Series[Any]") -> bool:
     if not words or not all(map(_is_number, words)):
         return False
     numbers = [float(word.replace(",", ".")) for word in words]
-    return all(b - a == 1 for a, b in zip(numbers, numbers[1:], strict=False))
+    return all(b - a == 1 for a, b in pairwise(numbers))
 
 
 def _is_number(text: str) -> bool:

@@ -1,6 +1,7 @@
 """Kinds of files that laboratories have, each small: what is right, or what the line of error says."""
 
 import gzip
+import re
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,8 @@ def test_without_a_header_the_first_line_is_data(study):
     assert rows(audacity) == [("bird 7", "song", 0.5, 1.25), ("bird 7", "click", 2.0, 2.0)]
 
 
-BORIS = "Observation id,Duration,Subject,Behavior,Start (s),Stop (s)\no1,{},m1,rest,0,5\no1,{},m1,walk,5,7\no2,{},m2,rest,0,3\n"
+BORIS = "Observation id,Duration,Subject,Behavior,Start (s),Stop (s)\n"
+BORIS += "o1,{},m1,rest,0,5\no1,{},m1,walk,5,7\no2,{},m2,rest,0,3\n"
 
 
 @pytest.mark.parametrize("length", ["", "600"])
@@ -90,7 +92,8 @@ def test_an_empty_duration_beside_a_stop_is_known(study):
     [("START", "STOP"), ("State start", "State stop"), ("start", "complete"), ("begin", "end"), ("on", "off")],
 )
 def test_words_for_starts_and_stops(start, stop, study):
-    text = "subject,behavior,event_type,time\nc1,Lying,{0},0\nc1,Lying,{1},5.2\nc1,Walking,{0},5.2\nc1,Sniff,Point,7\nc1,Walking,{1},10\n"
+    text = "subject,behavior,event_type,time\nc1,Lying,{0},0\nc1,Lying,{1},5.2\n"
+    text += "c1,Walking,{0},5.2\nc1,Sniff,Point,7\nc1,Walking,{1},10\n"
     assert rows(study(text.format(start, stop))) == [
         ("c1", "Lying", 0, 5.2),
         ("c1", "Walking", 5.2, 10),
@@ -104,12 +107,14 @@ def test_words_for_starts_and_stops(start, stop, study):
 
 
 def test_of_two_starts_at_once_a_stop_closes_the_earlier(study):
-    tie = "plan,action,type,time\no,walk,START,0\no,walk,START,2\no,walk,STOP,2\no,walk,STOP,5\no,nod,START,7\no,nod,STOP,7\n"
+    tie = "plan,action,type,time\no,walk,START,0\no,walk,START,2\no,walk,STOP,2\n"
+    tie += "o,walk,STOP,5\no,nod,START,7\no,nod,STOP,7\n"
     assert rows(study(tie)) == [("o", "walk", 0, 2), ("o", "walk", 2, 5), ("o", "nod", 7, 7)]
 
 
 def test_unpaired_rows_are_listed_dropped_or_open(study):
-    text = "plan,action,type,time\no,walk,START,0\no,walk,STOP,2\no,rest,STOP,3\no,eat,START,3\no,eat,STOP,9\no,dig,START,9\n"
+    text = "plan,action,type,time\no,walk,START,0\no,walk,STOP,2\no,rest,STOP,3\n"
+    text += "o,eat,START,3\no,eat,STOP,9\no,dig,START,9\n"
     with pytest.raises(
         ValueError, match=r"line 4: 'rest' has a stop without a start; --unpaired drop .*\(2 rows: 4, 7\)"
     ):
@@ -129,7 +134,7 @@ def test_a_behaviour_of_several_columns(study):
     assert rows(study(text, {"behaviour": ["Behavior", "Modifier #1"]})) == due
     assert rows(study(text, {"behaviour": "Behavior,Modifier #1"})) == due
     assert rows(study(text, {"behaviour": pd.Index(["Behavior", "Modifier #1"])})) == due
-    with pytest.raises(ValueError, match="--columns.behaviour 'Behavior,Modifier #1'"):
+    with pytest.raises(ValueError, match=r"--columns\.behaviour 'Behavior,Modifier #1'"):
         study(text)
 
 
@@ -252,9 +257,8 @@ def test_workbooks_and_binary_tables(suffix, tmp_path):
     ],
 )
 def test_what_cannot_be_read_is_one_line(content, words, study):
-    with pytest.raises(ValueError) as error:
+    with pytest.raises(ValueError, match=re.escape(words)) as error:
         study(content)
-    assert words in str(error.value)
     assert "f.csv" in str(error.value)
 
 
@@ -278,7 +282,8 @@ def test_labels_that_are_unknown_to_a_prior_are_an_error_or_gaps(study):
 
 
 def test_times_of_day_go_on_over_midnight(study):
-    text = "animal,behaviour,start,stop\nm1,rest,23:58:12,23:59:23.5\nm1,feed,23:59:23.5,00:00:22\nm1,rest,00:00:22,00:01:32\n"
+    text = "animal,behaviour,start,stop\nm1,rest,23:58:12,23:59:23.5\n"
+    text += "m1,feed,23:59:23.5,00:00:22\nm1,rest,00:00:22,00:01:32\n"
     found = study(text)
     np.testing.assert_allclose(found.events["start"], [86292, 86363.5, 86422])
     np.testing.assert_allclose(found.events["stop"] - found.events["start"], [71.5, 58.5, 70])
@@ -309,9 +314,7 @@ def test_two_observers_of_one_session_are_refused_or_kept_apart(study):
     text += "".join(
         f"s1,m1,{b},{start},{stop},Anna\ns1,m1,{b},{start + 0.2},{stop + 0.3},Ben\n" for b, start, stop in anna
     )
-    with pytest.raises(
-        ValueError, match="overlap another of the same subject and behaviour.*'scored by' keeps them apart"
-    ):
+    with pytest.raises(ValueError, match="overlap another of the same subject"):
         study(text)
     with pytest.raises(ValueError, match="overlap another"):
         study(text, {"observer": "none"})

@@ -1,0 +1,104 @@
+"""Rows of sequences: a behaviour in each column, or a whole sequence in one cell."""
+
+import re
+
+import numpy as np
+import pandas as pd
+
+from neuroprior.behaviour.reading.names import plain
+from neuroprior.behaviour.reading.table import MIN_REPEATS, Part, Table
+
+SPS = re.compile(r"\(?([^(),]+),\s*(\d+(?:\.\d+)?)\)?")
+SPLITS = ("-", "|", ";", ",", " ", "/")
+"""Between the behaviours of a sequence that stands in one cell."""
+
+
+def rows_of_sequences(table: Table) -> Part:
+    """Read one row a sequence, a behaviour in each column; empty cells behind the last one are its end."""
+    names = table.roles.at["behaviour"]
+    cells = table.frame[names].to_numpy(object)
+    labels = table.labels(cells.ravel()).reshape(cells.shape)
+    reach = np.where(labels != "", np.arange(1, 1 + len(names)), 0).max(1, initial=0)
+    empty = int((reach == 0).sum())
+    row_names = next((name for name in table.frame if name.startswith("(column ")), None)
+    if "recording" not in table.roles.at:
+        if row_names and table.frame[row_names].is_unique:
+            table.recording = table.frame[row_names].to_numpy(object)
+        elif "subject" in table.roles.at and pd.Series(table.subject).is_unique:
+            table.recording = table.subject
+        elif whose := _names_of_rows(table):
+            table.recording = table.frame[whose].to_numpy(object)
+            table.notes.append(f"the column {whose!r} is taken for the names of the recordings")
+        else:
+            table.recording = np.array([str(i + 1) for i in range(table.size)], dtype=object)
+    if empty:
+        table.notes.append(f"{empty:,} rows have no behaviour (first in {table.place(int((reach == 0).argmax()))})")
+        table.empty = [str(name) for name in table.recording[reach == 0]]
+    taken = np.arange(len(names)) < reach[:, None]
+    rows, steps = taken.nonzero()
+    flat = labels[taken]
+    table.unit = table.unit or "steps"
+    if (flat == "").any():
+        table.notes.append(
+            f"{int((flat == '').sum()):,} cells within sequences have no label: another fragment begins after each"
+        )
+    part = table.part(rows.astype(np.int64), flat, steps.astype(np.float64), steps + 1.0)
+    again = (part.events["behaviour"].to_numpy()[1:] == part.events["behaviour"].to_numpy()[:-1]) & (
+        np.diff(part.fragment) == 0
+    )
+    if len(again) and again.mean() > MIN_REPEATS:
+        part.first_notes.append(
+            f"{again.mean():.0%} of the cells repeat the one before: --merge_repeats true makes each run one bout"
+        )
+    return part
+
+
+def _names_of_rows(table: Table) -> str | None:
+    """Return the first column that is not used and holds a name of its own in each row, if there is one."""
+    used = table.roles.used()
+    texts = (name for name in table.frame if name not in used and table.frame[name].is_unique)
+    return next((str(name) for name in texts if not table.frame[name].str.fullmatch(r"[-\d.,]*").any()), None)
+
+
+def strings_of_sequences(table: Table) -> Part | None:
+    """Read sequences that each stand in one cell: "a-b-c", or "(school,3)-(work,16)" with durations (SPS)."""
+    names = table.roles.at["behaviour"]
+    if table.roles.at.get("start") or len(names) > 1 or not table.size:
+        return None
+    cells = pd.Series(table.joined(names))
+    filled = cells[cells != ""]
+    if not len(filled):
+        return None
+    timed = filled.str.fullmatch(r"\(?[^(),]+,\s*\d+(\.\d+)?\)?(\s*-\s*\(?[^(),]+,\s*\d+(\.\d+)?\)?)*")
+    own = plain(names[0]) in ("sequence", "seq", "sequences")
+    separator = ""
+    if not (timed.mean() > 0.9):
+        keys = pd.Series(list(zip(table.recording, table.subject, strict=True)))
+        alone = own or ("subject" in table.roles.at and keys.is_unique)
+        counts = {one: float(filled.str.contains(one, regex=False).mean()) for one in SPLITS}
+        separator = max(SPLITS, key=lambda one: counts[one])
+        if not alone or counts[separator] <= 0.5:
+            return None
+        pieces = {word for text in filled for word in text.split(separator)}
+        if len(pieces) >= filled.str.count(re.escape(separator)).add(1).sum() * 0.9 and len(filled) > 1:
+            return None
+    table.unit = "steps"
+    if "recording" not in table.roles.at:
+        by_subject = "subject" in table.roles.at and pd.Series(table.subject).is_unique
+        table.recording = (
+            table.subject if by_subject else np.array([str(i + 1) for i in range(table.size)], dtype=object)
+        )
+    rows: list[int] = []
+    labels: list[str] = []
+    lengths: list[float] = []
+    for row, text in enumerate(cells):
+        pieces_of = SPS.findall(text) if not separator else [(word.strip(), "1") for word in text.split(separator)]
+        rows += [row] * len(pieces_of)
+        labels += [word.strip() for word, _ in pieces_of]
+        lengths += [float(length) for _, length in pieces_of]
+    row_of = np.array(rows, np.int64)
+    ends = pd.Series(lengths).groupby(row_of).cumsum().to_numpy().astype(np.float64)
+    what = "states with durations" if not separator else f"behaviours parted by {separator!r}"
+    table.notes.append(f"each cell of {names[0]!r} is read as a sequence, {what}")
+    named = table.labels(np.array(labels, dtype=object))
+    return table.part(row_of, named, (ends - np.array(lengths)).astype(np.float64), ends)

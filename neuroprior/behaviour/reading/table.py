@@ -1,0 +1,337 @@
+"""A sheet whose columns are known, and the events that are read from it: what all layouts share."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from neuroprior.behaviour.reading.columns import Roles
+from neuroprior.behaviour.reading.names import NO_SUBJECT, plain
+from neuroprior.behaviour.reading.options import Options
+from neuroprior.behaviour.reading.problems import Problems
+from neuroprior.behaviour.reading.sheets import Sheet
+from neuroprior.behaviour.reading.times import CLOCKS, DATES, Times, read_times
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+JOIN = "|"
+"""Between the labels of several columns."""
+
+UNIT = re.compile(r"\(?(s|ms|sec|seconds|min|frames|h|)\)?", re.IGNORECASE)
+"""A unit of time in a row below the header."""
+
+MIN_REPEATS = 0.3
+"""Share of rows with the label of the row before, at least which rows at equal steps are frames."""
+
+MAX_OVERLAP = 0.05
+"""Share of bouts that overlap a bout of the same behaviour, above which something is wrong."""
+
+
+@dataclass
+class Part:
+    """Events of one sheet.
+
+    Attributes:
+        events: a pandas frame with the columns `recording, subject, behaviour, start, stop` ("" for no label),
+            `observer` where one is used, factors and contexts, in the order of the recordings and of time.
+        fragment: int `[events]`, numbered from 0; between two fragments of one recording nobody watched, or nothing
+            was scored.
+        rows: int `[events]`, the row of the sheet that each begins with.
+        unit: of the times: "s", "frames", "steps" or "" where it is not known.
+        notes, first_notes: a line each; the first ones are weighty.
+        empty: recordings without events.
+        spans: when each recording was watched, where rows say so; see `Recordings.spans`.
+    """
+
+    sheet: Sheet
+    roles: Roles
+    events: Any
+    fragment: Integers
+    rows: Integers
+    unit: str = ""
+    notes: list[str] = field(default_factory=list)
+    first_notes: list[str] = field(default_factory=list)
+    empty: list[str] = field(default_factory=list)
+    spans: pd.DataFrame | None = None
+
+
+class Table:
+    """A sheet whose columns are known, and what its layouts share.
+
+    Args:
+        sheet: the sheet.
+        roles: what its columns hold.
+        options: how it is read.
+        problems: gets what is wrong.
+    """
+
+    def __init__(self, sheet: Sheet, roles: Roles, options: Options, problems: Problems) -> None:
+        self.sheet, self.roles, self.options, self.problems = sheet, roles, options, problems
+        self.notes: list[str] = [*sheet.notes, *roles.notes]
+        self.first_notes: list[str] = []
+        self.empty: list[str] = []
+        self.unit = roles.program.unit if roles.program else ""
+        self._drop_rows()
+        self.frame = sheet.frame
+        self.size = len(self.frame)
+        self.recording = self._keys("recording", self._name_of_file())
+        self.subject = self._subjects()
+        self.observer = self._keys("observer", "")
+        self.has_time = bool(self.roles.at.get("start"))
+
+    def place(self, row: int) -> str:
+        """Return where a row stands."""
+        return self.sheet.place(row)
+
+    def _drop_rows(self) -> None:
+        """Leave out a row of units below the header, totals, and rows that a program writes twice."""
+        sheet, at = self.sheet, self.roles.at
+        if not len(sheet.frame):
+            return
+        keep = np.ones(len(sheet.frame), bool)
+        timed = [name for use in ("start", "stop", "duration") for name in at.get(use, [])]
+        label = [name for name in at.get("behaviour", []) if self.roles.layout != "rows of sequences"]
+        first = sheet.frame.iloc[0]
+        units = [first[name] for name in timed]
+        if any(units) and all(map(UNIT.fullmatch, units)):
+            keep[0] = False
+            self.notes.append(f"line {sheet.lines[0]} holds units, and is not read as a row")
+            self.unit = self.unit or units[0].strip("()").lower().removesuffix("ec").removesuffix("econds")
+        if label and self.roles.layout == "events":
+            nothing = sheet.frame[label + timed].eq("").all(axis=1).to_numpy()
+            whose = [name for use in ("recording", "subject") for name in at.get(use, [])]
+            unowned = np.zeros(len(keep), bool)
+            for name in whose:
+                empty = sheet.frame[name].eq("").to_numpy()
+                unowned |= empty & (not empty.all())
+            loose = nothing & (unowned if whose else np.zeros(len(keep), bool)) & keep
+            if loose.any():
+                keep &= ~loose
+                row = int(loose.argmax())
+                self.notes.append(
+                    f"{loose.sum():,} rows without behaviour, time and owner are left out ({sheet.place(row)})"
+                )
+        view = next((name for name in sheet.frame if plain(name) == "view"), None)
+        if self.roles.program and self.roles.program.name.startswith("Raven") and view:
+            twice = sheet.frame.drop(columns=view).duplicated().to_numpy()
+            if twice.any():
+                keep &= ~twice
+                self.notes.append(f"{twice.sum():,} rows are other views of the same selections, and left out")
+        if not keep.all():
+            sheet.frame = sheet.frame[keep].reset_index(drop=True)
+            sheet.lines = sheet.lines[keep]
+
+    def joined(self, names: list[str]) -> NDArray[Any]:
+        """Return the texts of columns, joined by "|" where there are several; empty ones are left out."""
+        texts = [self.frame[name].to_numpy(object) for name in names]
+        if len(texts) == 1:
+            return np.asarray(texts[0], dtype=object)
+        codes = [pd.factorize(one) for one in texts]
+        key = np.zeros(self.size, np.int64)
+        for numbers, values in codes:
+            key = key * (len(values) + 1) + numbers
+        kinds, first, inverse = np.unique(key, return_index=True, return_inverse=True)
+        labels = [JOIN.join(str(one[i]) for one in texts if one[i]) for i in first]
+        return np.array([*labels, ""], dtype=object)[inverse] if len(kinds) else np.array([], dtype=object)
+
+    def _name_of_file(self) -> str:
+        above = {plain(name): value for name, value in self.sheet.above.items()}
+        named = next(
+            (above[key] for key in ("observation id", "trial name", "observation", "video") if above.get(key)), ""
+        )
+        return re.sub(r"\s+", " ", named) or self.sheet.stem
+
+    def _keys(self, use: str, default: str) -> NDArray[Any]:
+        names = self.roles.at.get(use)
+        if not names:
+            return np.full(self.size, default, dtype=object)
+        keys = _whole_numbers(self.joined(names))
+        empty = keys == ""
+        if use == "recording" and empty.any() and not empty.all():
+            rows = np.flatnonzero(empty)
+            self.notes.append(
+                f"{rows.size:,} rows have no recording ({self.place(int(rows[0]))}); they are called {default!r}"
+            )
+        return np.where(empty, default, keys)
+
+    def _subjects(self) -> NDArray[Any]:
+        names = self.roles.at.get("subject")
+        if not names:
+            above = {plain(name): value for name, value in self.sheet.above.items()}
+            owner = next((above[key] for key in ("subject name", "animal id", "subject") if above.get(key)), "")
+            return np.full(self.size, owner, dtype=object) if owner else np.full(self.size, "", dtype=object)
+        keys = _whole_numbers(self.joined(names))
+        codes, values = pd.factorize(keys)
+        nobody = np.array([str(one).lower() in NO_SUBJECT for one in values] or [False])
+        if nobody.any():
+            self.notes.append(
+                f"{int(nobody[codes].sum()):,} rows are of {values[nobody.argmax()]!r}, taken as a subject"
+            )
+        return keys
+
+    def labels(self, texts: NDArray[Any]) -> NDArray[Any]:
+        """Return labels as the user wants them: "" where one is missing, renamed, and without those to drop."""
+        codes, values = pd.factorize(texts)
+        labels = [self.options.label(str(value)) for value in values]
+        numbers = [label for label in labels if label]
+        if "-1" in numbers and all(number.isdecimal() for number in numbers if number != "-1"):
+            rows = np.flatnonzero(np.array(labels, dtype=object)[codes] == "-1")
+            self.first_notes.append(
+                f"the label -1 ({rows.size:,} rows, first in {self.place(int(rows[0]) % max(self.size, 1))})"
+                " stands for none, as"
+                " clusterings write it; --rename -1=noise makes it a behaviour"
+            )
+            labels = ["" if label == "-1" else label for label in labels]
+        found = np.array([*labels, ""], dtype=object)[codes]
+        if self.options.missing == "error" and (found == "").any():
+            rows = np.flatnonzero(found == "")
+            what = f"`behaviour` must be known, got {str(texts[rows[0]])!r}"
+            self.problems.add(what, (rows % max(self.size, 1)).tolist(), self.place)
+        return found
+
+    def times(self, use: str) -> Times | None:
+        """Return the times of a use, or None; day by day on from midnight where they are times of day."""
+        names = self.roles.at.get(use)
+        if not names:
+            return None
+        texts = self.frame[names[0]].to_numpy(object)
+        for name in names[1:]:
+            texts = texts + " " + self.frame[name].to_numpy(object)
+        found = read_times(
+            texts, use, self.place, self.problems, separator=self.sheet.separator, day_first=self.options.day_first
+        )
+        if use == "start":
+            if found.kind == CLOCKS or found.kind == DATES:
+                self.unit = "s"
+            else:
+                self.unit = self.unit or _unit_of(names[0], self.sheet.above)
+        return found
+
+    def unit_codes(self) -> Integers:
+        """Return the number of the recording and subject (and observer) of each row."""
+        key = pd.Series(list(zip(self.recording, self.subject, self.observer, strict=True)), dtype=object)
+        return pd.factorize(key)[0].astype(np.int64)
+
+    def split_sessions(self, start: Floats, labels: NDArray[Any], stop: Floats | None = None) -> None:
+        """Give sessions without a name one each, where the time starts again within a recording.
+
+        Rows that are merely in another order than time, such as sorted by behaviour, are left as they are.
+        """
+        unit = self.unit_codes()
+        order = np.argsort(unit, kind="stable")
+        when, same = start[order], np.diff(unit[order], prepend=-1) == 0
+        known = pd.Series(when).groupby(unit[order]).ffill().to_numpy(np.float64)
+        back = np.zeros(len(order), bool)
+        back[1:] = same[1:] & (known[1:] < known[:-1])
+        if not back.any():
+            return
+        block_sorted = np.cumsum(back | ~same)
+        block = np.empty(len(order), np.int64)
+        block[order] = block_sorted
+        frame = pd.DataFrame({"unit": unit, "block": block, "start": start, "label": labels})
+        blocks = frame.groupby("block").agg(
+            unit=("unit", "first"),
+            low=("start", "min"),
+            high=("start", "max"),
+            size=("start", "size"),
+            kinds=("label", "nunique"),
+        )
+        blocks["before"] = blocks.groupby("unit")["high"].shift()
+        blocks["lowest"] = blocks.groupby("unit")["low"].transform("min")
+        again = blocks.dropna(subset="before")
+        span = (again["before"] - again["lowest"]).clip(lower=0)
+        restarts = (again["low"] - again["lowest"] <= 0.5 * span) & (again["kinds"] > 1) & (again["size"] >= 3)
+        if not len(again) or restarts.mean() < 0.9:
+            return
+        if stop is not None and not overlaps(unit, start, stop) > MAX_OVERLAP:
+            return
+        chosen = set(again.index[restarts])
+        rows = np.array([int(np.flatnonzero(block == one)[0]) for one in sorted(chosen)])
+        if "recording" in self.roles.at:
+            what = "the time starts again within a recording"
+            what += "; say which column tells its sessions apart (--columns.recording)"
+            self.problems.add(what, rows.tolist(), self.place)
+            return
+        number = blocks.index.isin(chosen)
+        session = pd.Series(number, index=blocks.index).groupby(blocks["unit"]).cumsum().add(1)
+        numbers = session.reindex(block).to_numpy(np.int64)
+        self.recording = np.array(
+            [f"{name} ({n})" for name, n in zip(self.recording, numbers, strict=True)], dtype=object
+        )
+        self.first_notes.append(
+            f"the time starts again {len(rows):,} times, first in {self.place(int(rows[0]))}: what follows is"
+            " read as another"
+            " recording"
+        )
+
+    def part(
+        self, rows: Integers, labels: NDArray[Any], start: Floats, stop: Floats, cut: NDArray[np.bool_] | None = None
+    ) -> Part:
+        """Return the events of rows, in the order of their recordings and of time.
+
+        Args:
+            rows: int `[events]`.
+            labels: `[events]`, "" where none is known: what follows is another fragment.
+            start, stop: float64 `[events]`.
+            cut: bool `[events]`, True where a fragment begins; None: after events without a label.
+        """
+        events = pd.DataFrame({
+            "recording": self.recording[rows], "subject": self.subject[rows], "behaviour": labels,
+            "start": start, "stop": stop,
+        })  # fmt: skip
+        if "observer" in self.roles.at:
+            events["observer"] = self.observer[rows]
+        for name in [*self.roles.at.get("factors", []), *self.roles.at.get("context", [])]:
+            events[name] = self.frame[name].to_numpy(object)[rows]
+        keys = ["recording", "subject", "observer"] if "observer" in events else ["recording", "subject"]
+        # Recordings stay in the order in which they appear.
+        appear = [pd.factorize(events[key])[0] for key in keys]
+        untimed = np.isnan(start)
+        clock = np.where(untimed, -np.inf, start) if not untimed.all() else np.zeros(len(start))
+        if untimed.any() and not untimed.all():
+            clock = pd.Series(start).groupby(list(appear)).ffill().fillna(-np.inf).to_numpy()
+        order = np.lexsort((np.arange(len(events)), clock, *reversed(appear)))
+        events, rows = events.iloc[order].reset_index(drop=True), rows[order]
+        begin = np.zeros(len(events), bool)
+        for codes in appear:
+            begin |= np.diff(codes[order], prepend=-1) != 0
+        if cut is not None:
+            begin |= cut[order]
+        missing = events["behaviour"].eq("").to_numpy()
+        begin[1:] |= missing[:-1]
+        fragment = np.cumsum(begin | missing) - 1
+        events, fragment, rows = events[~missing].reset_index(drop=True), fragment[~missing], rows[~missing]
+        fragment = np.unique(fragment, return_inverse=True)[1].astype(np.int64)
+        return Part(self.sheet, self.roles, events, fragment, rows, self.unit, self.notes, self.first_notes, self.empty)
+
+
+def _whole_numbers(keys: NDArray[Any]) -> NDArray[Any]:
+    """Return keys without the ".0" that pandas adds to whole numbers beside empty cells."""
+    codes, values = pd.factorize(keys)
+    if len(values) and all(re.fullmatch(r"-?\d+\.0|", str(value)) for value in values):
+        return np.array([str(value).removesuffix(".0") for value in values], dtype=object)[codes]
+    return keys
+
+
+def _unit_of(name: str, above: Mapping[str, str]) -> str:
+    low = name.lower()
+    if "frame" in low or "image" in low:
+        return "frames"
+    if re.search(r"\b(ms|msec|milliseconds?)\b", low.replace("_", " ")):
+        return "ms"
+    return "s" if re.search(r"\b(s|sec|secs|seconds?|sf)\b", low.replace("_", " ")) else ""
+
+
+def overlaps(unit: Integers, start: Floats, stop: Floats) -> float:
+    """Return the share of bouts that begin before an earlier one of the same unit ended."""
+    order = np.lexsort((start, unit))
+    latest = pd.Series(stop[order]).groupby(unit[order]).cummax().to_numpy()
+    same = np.diff(unit[order], prepend=-1) == 0
+    before = np.append(np.nan, latest[:-1])
+    size = np.abs(np.where(np.isfinite(before), before, 0)) * 1e-9 + 1e-9
+    return float((same & (start[order] < before - size)).mean()) if len(order) else 0.0
