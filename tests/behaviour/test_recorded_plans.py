@@ -38,6 +38,9 @@ def test_times_are_stored_where_there_are_actions():
     assert told(PLANS.durations) == [[2.5, 1.5, None], [0, 3, 0], [7, 0, 0]]
     shown = RecordedPlans(PLANS.actions, 3, PLANS.lengths, began=torch.ones(3, 3), durations=torch.ones(3, 3))
     assert shown.began.tolist() == shown.durations.tolist() == [[1, 1, 1], [1, 1, 0], [1, 0, 0]]
+    ones = torch.ones(1, 3)
+    ended = RecordedPlans(torch.tensor([[0, 1, 2]]), 3, end=2, began=ones, durations=ones)
+    assert (told(ended.began), told(ended.durations)) == ([[1, 1, None]], [[1, 1, 0]])
 
 
 @pytest.mark.parametrize("index", [slice(1, 3), torch.tensor([2, 0]), torch.tensor([True, False, True])])
