@@ -1,6 +1,7 @@
 """Plans that are parts of recordings: times, conditions and names stay with their plans, in memory and in files."""
 
 import math
+import warnings
 
 import pytest
 import torch
@@ -103,6 +104,10 @@ def test_npz_files_hold_everything_and_others_refuse_it(tmp_path):
     assert plans_digest(back) == plans_digest(PLANS)
     with pytest.warns(UserWarning, match="arrays that are not used: recording, began, durations, condition, condition"):
         assert type(read_plans(tmp_path / "a.npz")) is Plans
+    write_plans(RecordedPlans.of(Plans(PLANS.actions, 3)), tmp_path / "plain.npz")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert read_plans(tmp_path / "plain.npz").actions.equal(PLANS.actions)
     for name in ("a.jsonl", "a.csv"):
         with refuses(name, "recording, condition, began, durations of RecordedPlans are written to .npz files only"):
             write_plans(PLANS, tmp_path / name)
