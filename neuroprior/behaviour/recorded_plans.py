@@ -20,6 +20,7 @@ class RecordedPlans(Plans):
     """N sequences of up to L actions that are parts of recordings, such as those between gaps.
 
     Attributes:
+        actions, num_actions, lengths, action_names, context, group, context_names, group_names, end: see `Plans`.
         recording: N names of the recordings that the plans are parts of, or None. Recordings of different groups may
             have the same name.
         began: when each action began, in the time of the recording, floating point `[N, L]`, stored as float64: NaN
@@ -66,7 +67,8 @@ class RecordedPlans(Plans):
         if self.condition is not None:
             object.__setattr__(self, "condition", as_integers("condition", self.condition, num))
         check_numbered("condition", self.condition, self.condition_names)
-        check_texts("notes", self.notes)
+        if check_texts("notes", self.notes):
+            object.__setattr__(self, "notes", tuple(self.notes))
 
     def _times(self, name: str, values: Tensor, dtype: torch.dtype, lowest: float) -> Tensor:
         """Numbers `[N, L]`, where there are actions finite and at least `lowest`, or NaN."""

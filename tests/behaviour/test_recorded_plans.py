@@ -1,6 +1,7 @@
 """Plans that are parts of recordings: times, conditions and names stay with their plans, in memory and in files."""
 
 import math
+import warnings
 
 import pytest
 import torch
@@ -38,6 +39,9 @@ def test_times_are_stored_where_there_are_actions():
     assert told(PLANS.durations) == [[2.5, 1.5, None], [0, 3, 0], [7, 0, 0]]
     shown = RecordedPlans(PLANS.actions, 3, PLANS.lengths, began=torch.ones(3, 3), durations=torch.ones(3, 3))
     assert shown.began.tolist() == shown.durations.tolist() == [[1, 1, 1], [1, 1, 0], [1, 0, 0]]
+    ones = torch.ones(1, 3)
+    ended = RecordedPlans(torch.tensor([[0, 1, 2]]), 3, end=2, began=ones, durations=ones)
+    assert (told(ended.began), told(ended.durations)) == ([[1, 1, None]], [[1, 1, 0]])
 
 
 @pytest.mark.parametrize("index", [slice(1, 3), torch.tensor([2, 0]), torch.tensor([True, False, True])])
@@ -100,6 +104,10 @@ def test_npz_files_hold_everything_and_others_refuse_it(tmp_path):
     assert plans_digest(back) == plans_digest(PLANS)
     with pytest.warns(UserWarning, match="arrays that are not used: recording, began, durations, condition, condition"):
         assert type(read_plans(tmp_path / "a.npz")) is Plans
+    write_plans(RecordedPlans.of(Plans(PLANS.actions, 3)), tmp_path / "plain.npz")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert read_plans(tmp_path / "plain.npz").actions.equal(PLANS.actions)
     for name in ("a.jsonl", "a.csv"):
         with refuses(name, "recording, condition, began, durations of RecordedPlans are written to .npz files only"):
             write_plans(PLANS, tmp_path / name)

@@ -14,7 +14,9 @@ from neuroprior import ContextTreePrior, GRUPrior, MarkovPrior, Plans, Prior, Un
 from neuroprior.behaviour.analysis.comparison import score
 from neuroprior.behaviour.report.document import records, results_of
 from neuroprior.behaviour.report.plan_report import report
+from neuroprior.behaviour.tables import read_events
 from neuroprior.plans import read_plans, write_plans
+from tests.support.events import write_events
 from tests.support.sources import seeded
 
 pytestmark = pytest.mark.usefixtures("undrawn")
@@ -175,8 +177,8 @@ def test_contexts_are_known_by_name(make, kind, tmp_path):
     prior = make()
     prior = prior.fit(learned) if isinstance(prior, MarkovPrior) else prior.fit(learned, max_steps=30, progress=False)
     folder = str(save(prior, tmp_path / "prior"))
-    write_plans(new, tmp_path / "new.csv")
-    assert read_plans(tmp_path / "new.csv").context_names == ("cold", "warm")
+    (write_events if kind == "step" else write_plans)(new, tmp_path / "new.csv")
+    assert read_events(tmp_path / "new.csv").context_names == ("cold", "warm")
     rows = evaluate(tmp_path / "new.csv", [folder])
     assert rows[0]["context"] == "actions and context"
     assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), new), abs=1e-6)
@@ -232,7 +234,7 @@ def test_ends_and_contexts_together(tmp_path):
     learned, new = in_contexts(kind="step"), in_contexts(40, 9, "step", contexts=2)
     new = replace(new, context=2 * new.context, context_names=CONTEXTS)
     folder = saved(MarkovPrior(4, 1, num_contexts=3), learned.with_end(), tmp_path / "prior")
-    write_plans(new, tmp_path / "new.csv")
+    write_events(new, tmp_path / "new.csv")
     rows = evaluate(tmp_path / "new.csv", [folder])
     assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), new.with_end()), abs=1e-6)
 

@@ -17,6 +17,7 @@ from neuroprior.plans import read_plans, write_minari, write_plans
 from neuroprior.priors import StackedPrior
 from neuroprior.priors.scoring import learned_from
 from neuroprior.training import Settings
+from tests.support.events import write_events
 from tests.support.sources import seeded
 
 pytestmark = pytest.mark.usefixtures("undrawn")
@@ -147,7 +148,7 @@ def test_each_kind_of_file(name, tmp_path, monkeypatch):
     if name.startswith("minari:"):
         write_minari(plans, name.removeprefix("minari:"))
     else:
-        write_plans(plans, tmp_path / name)
+        (write_events if name == "steps.csv" else write_plans)(plans, tmp_path / name)
         name = str(tmp_path / name)
     assert main([*small(kind, tmp_path / "run"), name]) == 0
     report = metrics(tmp_path / "run")

@@ -67,8 +67,10 @@ def write_npz(plans: Plans, path: Path) -> None:
     for key, value in values.items():
         if isinstance(value, torch.Tensor):
             arrays[key] = as_array(value)
-        elif value is not None:
-            arrays[key] = np.array(value, None if isinstance(value, int) else str)
+        elif isinstance(value, int):
+            arrays[key] = np.array(value)
+        elif value:
+            arrays[key] = np.array(value, str)
     with written_whole(path, "wb") as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]
 
