@@ -18,8 +18,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 SMOKE = ROOT / ".ci" / "smoke"
-EXTRAS = ("report", "cli", "dask", "gym", "mujoco", "bench", "docs", "dev")
-LIBRARY = ("report", "cli", "dask", "gym", "mujoco")
+EXTRAS = ("report", "tables", "cli", "dask", "gym", "mujoco", "bench", "docs", "dev")
+LIBRARY = ("report", "tables", "cli", "dask", "gym", "mujoco")
 """The extras without those whose packages only compare, build pages or test."""
 
 ENVIRONMENTS: dict[str, tuple[tuple[str, ...], str]] = {

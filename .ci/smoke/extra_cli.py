@@ -5,9 +5,10 @@ import sys
 from pathlib import Path
 
 PROGRAM = str(Path(sys.executable).with_name("neuroprior"))
-STUDY = ["study.csv", "--columns.action", "behaviour", "--columns.plan", "session", "--columns.group", "animal"]
+STUDY = ["study.csv"]
 for words in (
     ["example", "study.csv"],
+    ["check", *STUDY],
     [
         "fit",
         "--config",

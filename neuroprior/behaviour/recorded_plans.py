@@ -1,7 +1,7 @@
 """Plans that are parts of recordings of behaviour: with times, conditions and the names of the recordings."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -100,6 +100,54 @@ def durations_of(plans: Plans) -> Tensor:
             "durations: these plans have none; give RecordedPlans(durations=), or a file with start and stop times"
         )
     return durations
+
+
+def join_fragments(plans: Plans, *values: Tensor) -> tuple[Any, ...]:
+    """Return plans with the fragments of each recording joined to one, and values `[N, L]` of their actions alike.
+
+    What changes within a recording is measured over all of it, and not within the stretches between its gaps.
+
+    Args:
+        plans: N plans; those without names of recordings are left as they are.
+        values: `[N, L]` each, as the actions.
+
+    Example:
+        >>> plans = RecordedPlans(torch.tensor([[0, 1], [1, 0]]), 2, recording=("a", "a"))
+        >>> join_fragments(plans)[0].actions.tolist()
+        [[0, 1, 1, 0]]
+    """
+    recording = plans.recording if isinstance(plans, RecordedPlans) else None
+    if recording is None:
+        return plans, *values
+    group = [0] * len(plans) if plans.group is None else plans.group.tolist()
+    row_of, firsts = pd.factorize(pd.MultiIndex.from_arrays([list(recording), group]))
+    if len(firsts) == len(plans):
+        return plans, *values
+    assert isinstance(plans, RecordedPlans)
+    row = torch.from_numpy(row_of.astype(np.int64))
+    mask, first = plans.mask().cpu(), torch.from_numpy(np.unique(row_of, return_index=True)[1])
+    order = row.argsort(stable=True)
+    size = mask.sum(1)[order]
+    before = size.cumsum(0) - size
+    offset = torch.empty_like(size)
+    new = torch.ones_like(row, dtype=torch.bool)
+    new[1:] = row[order][1:] != row[order][:-1]
+    offset[order] = before - before[new][new.cumsum(0) - 1]
+    plan, step = mask.nonzero().unbind(1)
+    lengths = torch.zeros(len(firsts), dtype=torch.long).index_add_(0, row, mask.sum(1))
+    at = row[plan], offset[plan] + step
+
+    def wide(one: Tensor) -> Tensor:
+        shape = (len(firsts), int(lengths.max()), *one.shape[2:])
+        joined = torch.zeros(shape, dtype=one.dtype)
+        joined[at] = one.cpu()[mask]
+        return joined.to(one.device)
+
+    per_action: dict[str, Any] = {
+        name: wide(one) for name in plans.PER_ACTION if (one := getattr(plans, name)) is not None
+    }
+    joined = replace(plans[first], lengths=lengths, **per_action)
+    return joined, *map(wide, values)
 
 
 def plans_of_events(

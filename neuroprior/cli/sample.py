@@ -4,11 +4,14 @@ import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import pandas as pd
 import torch
 from jsonargparse.typing import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
+from neuroprior._files import written_whole
 from neuroprior.behaviour.durations.semi_markov import SemiMarkovPrior
+from neuroprior.behaviour.recorded_plans import durations_of
 from neuroprior.plans import Plans, write_plans
 from neuroprior.priors import Prior, load
 
@@ -32,7 +35,7 @@ def sample(
         temperature: divides the logits; above 1 plans are more varied, below 1 more alike.
         seed: of the random numbers: the same seed gives the same plans.
         out: file to write, `.jsonl`, `.csv` or `.npz`, which is not there yet; JSON lines on standard output by
-            default. Of a semi-Markov prior, `.npz` holds durations, too.
+            default. Of a semi-Markov prior, `.npz` and `.csv` hold durations, too: the latter with a row an event.
     """
     if seed >= 2**63:
         raise ValueError(f"seed: an integer from 0 to 2**63 - 1 is expected, not {seed}")
@@ -42,7 +45,8 @@ def sample(
     generator = torch.Generator().manual_seed(seed)
     given = _context(prior, context, folder, num_plans)
     plans: Plans
-    if isinstance(prior, SemiMarkovPrior) and out is not None and Path(out).suffix.lower() == ".npz":
+    timed = isinstance(prior, SemiMarkovPrior) and out is not None and Path(out).suffix.lower() in (".npz", ".csv")
+    if isinstance(prior, SemiMarkovPrior) and timed:
         plans = prior.sample_plans(num_plans, length, given, temperature=temperature, generator=generator)
         plans = plans.without_context()
     else:
@@ -51,13 +55,33 @@ def sample(
     if prior.end is not None:
         plans = plans.without_end()
     if out is not None:
-        write_plans(plans, out)
+        if timed and Path(out).suffix.lower() == ".csv":
+            with written_whole(Path(out)) as stream:
+                _events(plans).to_csv(stream, index=False, lineterminator="\n")
+        else:
+            write_plans(plans, out)
         print(f"wrote {num_plans} plans to {out}")
         return
     with TemporaryDirectory() as place:
         file = Path(place) / "plans.jsonl"
         write_plans(plans, file)
         sys.stdout.write(file.read_text(encoding="utf-8"))
+
+
+def _events(plans: Plans) -> pd.DataFrame:
+    """A frame with a row an action: the number of its plan as the recording, its name, when it began and ended."""
+    stop = durations_of(plans).double().cumsum(1)
+    plan, step = plans.mask().nonzero().unbind(1)
+    actions = plans.actions[plan, step].tolist()
+    ends, seconds = stop[plan, step].numpy(), durations_of(plans)[plan, step].double().numpy()
+    return pd.DataFrame(
+        {
+            "recording": (plan + 1).tolist(),
+            "behaviour": actions if plans.action_names is None else [plans.action_names[action] for action in actions],
+            "start": ends - seconds,
+            "stop": ends,
+        }
+    )
 
 
 def _context(prior: Prior, name: str | None, folder: str, num_plans: int) -> Tensor | None:

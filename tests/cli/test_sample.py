@@ -5,7 +5,7 @@ import torch
 
 from neuroprior import MarkovPrior, Plans, save
 from neuroprior.__main__ import main
-from neuroprior.behaviour import SemiMarkovPrior
+from neuroprior.behaviour import SemiMarkovPrior, read
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.report import ReadOptions
 from neuroprior.plans import read_plans
@@ -42,7 +42,9 @@ def test_samples_with_durations_are_those_of_the_library(tmp_path):
     assert plans.durations.equal(due.durations)
     assert plans.action_names == ("a", "b", "c")
     assert main(["sample", str(tmp_path / "prior"), *OPTIONS, "--out", str(tmp_path / "new.csv")]) == 0
-    assert read_plans(tmp_path / "new.csv", action_names=("a", "b", "c")).actions.equal(due.actions)
+    events = read(tmp_path / "new.csv").plans(action_names=("a", "b", "c"))
+    assert events.actions.equal(due.actions)
+    torch.testing.assert_close(events.durations, due.durations)
 
 
 @pytest.mark.parametrize(("given", "index"), [("wet", 1), ("dry", 0)])

@@ -33,7 +33,7 @@ def pinned(name: str) -> dict[str, str]:
 def test_lowest_versions_are_those_that_are_promised() -> None:
     """Of the library's own extras; the others compare, build pages or test."""
     extras = PROJECT["optional-dependencies"]
-    own = ("report", "cli", "dask", "gym", "mujoco")
+    own = ("report", "tables", "cli", "dask", "gym", "mujoco")
     asked = [*PROJECT["dependencies"], *(need for name in own for need in extras[name])]
     least = dict(re.match(r"([\w-]+)(?:\[\w+\])?>=(.+)", need).groups() for need in asked if ">=" in need)
     lowest = pinned("constraints-lowest.txt")

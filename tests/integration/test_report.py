@@ -11,10 +11,10 @@ import torch
 
 from eval.__main__ import main
 from neuroprior import ContextTreePrior, GRUPrior, MarkovPrior, Plans, Prior, UniformPrior, load, save
+from neuroprior.behaviour import read
 from neuroprior.behaviour.analysis.comparison import score
 from neuroprior.behaviour.report.document import records, results_of
 from neuroprior.behaviour.report.plan_report import report
-from neuroprior.behaviour.tables import read_events
 from neuroprior.plans import read_plans, write_plans
 from tests.support.events import write_events
 from tests.support.sources import seeded
@@ -178,7 +178,7 @@ def test_contexts_are_known_by_name(make, kind, tmp_path):
     prior = prior.fit(learned) if isinstance(prior, MarkovPrior) else prior.fit(learned, max_steps=30, progress=False)
     folder = str(save(prior, tmp_path / "prior"))
     (write_events if kind == "step" else write_plans)(new, tmp_path / "new.csv")
-    assert read_events(tmp_path / "new.csv").context_names == ("cold", "warm")
+    assert read(tmp_path / "new.csv").plans().context_names == ("cold", "warm")
     rows = evaluate(tmp_path / "new.csv", [folder])
     assert rows[0]["context"] == "actions and context"
     assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), new), abs=1e-6)

@@ -69,16 +69,17 @@ for words in json.loads(sys.argv[1]):
 
 
 @pytest.mark.slow
-def test_the_five_commands(installed: Path, tmp_path: Path) -> None:
+def test_the_six_commands(installed: Path, tmp_path: Path) -> None:
     """In one process, as libraries load for seconds; the next test runs the program itself."""
     example(str(tmp_path / "expected.csv"))
     events = pd.read_csv(tmp_path / "expected.csv")
     assert events["animal"].nunique() == 12
     events[events["animal"].isin(events["animal"].unique()[:3])].to_csv(tmp_path / "few.csv", index=False)
-    study = ["few.csv", "--columns.action", "behaviour", "--columns.plan", "session", "--columns.group", "animal"]
+    study = ["few.csv"]
     quick = ["--max_steps", "5", "--folds", "1"]
     commands = [
         ["example", "study.csv"],
+        ["check", "study.csv"],
         ["fit", "--config", "gru", *study, "--out", "gru", *quick],
         ["report", *study, "--priors", "gru", "--out", "report"],
         ["score", "gru", *study, "--out", "score"],

@@ -17,6 +17,7 @@ from torch import Tensor
 from neuroprior._checks import check_sizes
 from neuroprior._statistics import Difference, Interval, holm, ratio_difference
 from neuroprior.behaviour.analysis.comparison import units
+from neuroprior.behaviour.recorded_plans import RecordedPlans, join_fragments
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
 from neuroprior.plans.plans import check_are_plans
@@ -110,12 +111,11 @@ class ActionDrift:
 
 @dataclass(frozen=True, eq=False)
 class _Counted:
-    """For the M actions that count, in the order of the file: bits, plan, step, length of plan, unit; `[M]` each."""
+    """For the M actions that count, in the order of the file: bits, plan, place in it (0 to 1), unit; `[M]` each."""
 
     bits: Tensor
     plan: Tensor
-    step: Tensor
-    length: Tensor
+    place: Tensor
     unit: Tensor
 
 
@@ -144,8 +144,8 @@ def by_position(plans: Plans, bits: Tensor, mask: Tensor, parts: int = 10) -> Po
         4
     """
     check_sizes(parts=parts)
-    counted = _counted(plans, bits, mask)
-    place = (counted.step + 0.5) / counted.length
+    counted = _counted(*_joined(plans, bits, mask))
+    place = counted.place
     part = (place * parts).long().clamp(max=parts - 1)
     found = []
     for k in range(parts):
@@ -171,6 +171,7 @@ def by_plan(plans: Plans, bits: Tensor, mask: Tensor) -> PlanDrift:
         >>> plans = Plans(torch.tensor([[0, 1], [0, 0], [1, 1], [1, 0]]), 2)
         >>> found = by_plan(plans, action_bits(UniformPrior(2), plans), plans.mask())
     """
+    plans, bits, mask = _joined(plans, bits, mask)
     item, index, group, totals, actions = _items(plans, _counted(plans, bits, mask))
     numbers, inverse = group.unique(return_inverse=True)
     first = torch.full((len(numbers),), len(group)).scatter_reduce(0, inverse, torch.arange(len(group)), "amin")
@@ -202,6 +203,7 @@ def by_group(plans: Plans, bits: Tensor, mask: Tensor) -> GroupDrift:
         >>> plans = Plans(torch.tensor([[0, 1], [0, 0], [1, 1], [1, 0]]), 2, group=torch.tensor([0, 0, 1, 1]))
         >>> found = by_group(plans, action_bits(UniformPrior(2), plans), plans.mask())
     """
+    plans, bits, mask = _joined(plans, bits, mask)
     _, _, group, totals, actions = _items(plans, _counted(plans, bits, mask))
     order = group.argsort(stable=True)
     numbers, sizes = group.unique(return_counts=True)
@@ -239,6 +241,7 @@ def action_drift(plans: Plans) -> list[ActionDrift]:
         [0, 1]
     """
     check_are_plans(plans)
+    plans = join_fragments(plans)[0]
     length, step = plans.mask().sum(1)[:, None], torch.arange(plans.max_length, device=plans.actions.device)
     half = length // 2
     late = step >= length - half
@@ -264,26 +267,46 @@ def action_drift(plans: Plans) -> list[ActionDrift]:
     return [replace(one, corrected=float(p)) for one, p in zip(found, corrected, strict=True)]
 
 
-def _counted(plans: Plans, bits: Tensor, mask: Tensor) -> _Counted:
-    """The actions that count, after checks; on the device of `bits`."""
+def _joined(plans: Plans, bits: Tensor, mask: Tensor) -> tuple[Plans, Tensor, Tensor]:
+    """The plans, bits and mask with the fragments of each recording joined to one plan, after checks."""
     check_are_plans(plans)
     shape = plans.actions.shape
     if bits.shape != shape:
         raise ValueError(f"`bits` must have the shape {list(shape)} of the actions, got {list(bits.shape)}.")
     if mask.shape != shape or mask.dtype != torch.bool:
         raise ValueError(f"`mask` must be bool of shape {list(shape)}, got {mask.dtype} {list(mask.shape)}.")
-    mask, within = mask.to(bits.device), plans.mask().to(bits.device)
-    if bool((mask & ~within).any()):
-        where = (mask & ~within).nonzero()[0].tolist()
+    within = plans.mask().to(bits.device)
+    if bool((mask.to(bits.device) & ~within).any()):
+        where = (mask.to(bits.device) & ~within).nonzero()[0].tolist()
         raise ValueError(f"`mask{where}` must be False, where the plan has ended.")
+    plans, bits, mask = join_fragments(plans, bits, mask)
+    return plans, bits, mask
+
+
+def _counted(plans: Plans, bits: Tensor, mask: Tensor) -> _Counted:
+    """The actions that count, after checks; on the device of `bits`. The fragments of a recording are one plan."""
+    mask = mask.to(bits.device)
     if not bool(bits[mask].isfinite().all()):
         where = (mask & ~bits.isfinite()).nonzero()[0].tolist()
         raise ValueError(f"`bits{where}` must be finite, got {float(bits[tuple(where)])}.")
     unit = units(plans, mask)[mask]
     if len(unit) == 0 or bool((unit == unit[0]).all()):
         raise ValueError(f"`mask` must have at least two actions that count, got {len(unit)}.")
+    return _Counted(bits[mask].double(), mask.nonzero()[:, 0], _places(plans, mask), unit)
+
+
+def _places(plans: Plans, mask: Tensor) -> Tensor:
+    """Where in its plan each action that counts is, 0 to 1: in time, where all times are known, else by its number."""
     plan, step = mask.nonzero().unbind(1)
-    return _Counted(bits[mask].double(), plan, step, within.sum(1)[plan], unit)
+    within = plans.mask().to(mask.device)
+    began = plans.began if isinstance(plans, RecordedPlans) else None
+    if began is not None and bool(began[within].isfinite().all()):
+        began = began.to(mask.device)
+        low = began.masked_fill(~within, torch.inf).amin(1)
+        span = began.masked_fill(~within, -torch.inf).amax(1) - low
+        if bool((span > 0).all()):
+            return (began[mask] - low[plan]) / span[plan]
+    return (step + 0.5) / within.sum(1)[plan]
 
 
 def _items(plans: Plans, counted: _Counted) -> tuple[str, Tensor, Tensor, Tensor, Tensor]:

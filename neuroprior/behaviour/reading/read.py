@@ -27,7 +27,7 @@ def read(paths: Any, columns: Columns | Mapping[str, Any] | None = None, **optio
 
     Args:
         paths: a file, a folder, a glob, a pandas frame, or a list of these. Text (any separator, UTF-8, UTF-16,
-            Windows-1252), also in .gz and .zip; .xlsx, .xls, .ods, .parquet, .feather and .h5 need `pip install
+            Windows-1252), also in .gz and .zip; .xlsx, .xls, .ods, .parquet and .feather need `pip install
             'neuroprior[tables]'`.
         columns: which columns hold what: `Columns`, or a dict of some of its names.
         options: how they are read, see `neuroprior.behaviour.reading.Options`.

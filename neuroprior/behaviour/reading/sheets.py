@@ -146,9 +146,7 @@ def _with_extra(label: str, read: Any, source: Any, **options: Any) -> Any:
     try:
         return read(source, **options)
     except ImportError as error:
-        raise ImportError(
-            f"{label}: this kind of file needs more packages: pip install 'neuroprior[tables]'"
-        ) from error
+        raise ImportError(f"{label}: {error} (pip install 'neuroprior[tables]' for Excel and Parquet)") from error
     except Exception as error:  # the libraries raise a dozen kinds over damaged bytes
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise ReadingError(f"{label}: the file must be a whole table, got one that cannot be read ({reason})") from None

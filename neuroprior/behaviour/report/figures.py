@@ -348,10 +348,11 @@ def motif_figure(motifs: pd.DataFrame) -> Figure:
 def ethogram_figure(plans: Plans) -> Figure:
     """Plans as rows of coloured strips over time, one colour an action, by condition and group.
 
-    Time is the sum of the durations, in their unit, where plans have them; else a step is an action. A duration that is
-    not known is left blank, as long as the median one. Of actions shorter than one of `MOST_BINS` parts of the longest
-    plan some are not drawn. At most `MOST_ROWS` plans are drawn, evenly spaced; the figure says so. The parts of a plan
-    that was cut at gaps (plans of one recording and group) are in one row, in their order, with a blank between them.
+    Time is that of the recording, from its first action on, where it is known when all actions began: gaps are as long
+    as they were. Else it is the sum of the durations, where plans have them, and a step is an action where they have
+    none. A duration that is not known is left blank: until the next action, or as long as the median one. Of actions
+    shorter than one of `MOST_BINS` parts of the longest plan some are not drawn. At most `MOST_ROWS` plans are drawn,
+    evenly spaced; the figure says so. The fragments of a recording of one group are in one row, in their order.
 
     Args:
         plans: with names of actions and recordings, groups, conditions and durations where there are any.
@@ -392,7 +393,9 @@ def ethogram_figure(plans: Plans) -> Figure:
     place[row_of[np.searchsorted(whole, some)]] = np.arange(len(some))
     parts = np.argsort(place[row_of], kind="stable")
     parts = parts[place[row_of[parts]] >= 0]
-    shown, longest = _over_time(plans[torch.from_numpy(whole[parts])], place[row_of[parts]])
+    drawn_plans, rows = plans[torch.from_numpy(whole[parts])], place[row_of[parts]]
+    in_time = _known_times(drawn_plans)
+    shown, longest = (_in_real_time if in_time else _over_time)(drawn_plans, rows)
     image = np.zeros((lines, shown.shape[1], 4))
     image[np.add.outer(tops, range(4))] = palette[shown][:, None]
     figure, (axes,) = panels(1, 1, (WIDTH, 0.034 * lines + 0.7 + 0.22 * -(-len(keys) // columns)))
@@ -406,8 +409,9 @@ def ethogram_figure(plans: Plans) -> Figure:
         name = plans.condition_names[condition[row]] if plans.condition_names else f"condition {condition[row]}"
         axes.text(0, tops[row] - 2, short(name, 40), va="bottom", fontsize=9, weight="bold")
     axes.spines[["left", "top", "right"]].set_visible(False)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=plans.durations is None, min_n_ticks=1))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=plans.durations is None and not in_time, min_n_ticks=1))
     across = "action of the plan" if plans.durations is None else "time, in the unit of the durations"
+    across = "time since the first action, in the unit of the recordings" if in_time else across
     axes.set_xlabel(across + (f"; {len(some)} of {len(starts_row)} plans" if len(some) < len(starts_row) else ""))
     figure.legend(handles=keys, loc="outside lower left", ncols=columns, fontsize=9, handlelength=1, columnspacing=1.4)
     return figure
@@ -422,6 +426,37 @@ def _rows_of(plans: RecordedPlans, index: NDArray[np.int64]) -> NDArray[np.int64
     _, first, row = np.unique(np.stack([names, group]), axis=1, return_index=True, return_inverse=True)
     rows: NDArray[np.int64] = np.argsort(np.argsort(first))[row.reshape(-1)]  # in the order of the plans
     return rows
+
+
+def _known_times(plans: RecordedPlans) -> bool:
+    """Whether it is known of all actions when they began, and in their order."""
+    if plans.began is None:
+        return False
+    mask = plans.mask()
+    return bool(plans.began[mask].isfinite().all()) and float(plans.began[mask].max()) > float(plans.began[mask].min())
+
+
+def _in_real_time(plans: RecordedPlans, row: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
+    """The action `[R, bins]` in R rows at evenly spaced times of their recordings, A for none; see `_over_time`."""
+    mask = plans.mask().cpu().numpy()
+    assert plans.began is not None
+    began = plans.began.cpu().double().numpy()[mask]
+    seconds = np.full(len(began), np.nan) if plans.durations is None else plans.durations.cpu().double().numpy()[mask]
+    at_row, actions = np.repeat(row, mask.sum(1)), plans.actions.cpu().numpy()[mask]
+    first = np.full(int(row[-1]) + 1, np.inf)
+    np.minimum.at(first, at_row, began)
+    begin = began - first[at_row]
+    end = np.where(np.isnan(seconds), np.inf, begin + seconds)
+    longest = float(np.where(np.isfinite(end), end, begin).max()) or 1.0
+    at = (np.arange(MOST_BINS) + 0.5) * longest / MOST_BINS
+    shown = np.full((len(first), MOST_BINS), plans.num_actions)
+    for number in range(len(first)):
+        own = np.flatnonzero(at_row == number)
+        own = own[np.argsort(begin[own], kind="stable")]
+        last = np.searchsorted(begin[own], at, side="right") - 1
+        inside = (last >= 0) & (at < end[own][last]) & (np.isfinite(end[own][last]) | (last < len(own) - 1))
+        shown[number] = np.where(inside, actions[own][last], plans.num_actions)
+    return shown, longest
 
 
 def _over_time(plans: RecordedPlans, row: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:

@@ -1,7 +1,7 @@
 """Drift by hand, where it was planted with a known size, and where there is none; short plans and a single long one."""
 
 import math
-from itertools import permutations
+from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from scipy import stats
 from neuroprior import Plans
 from neuroprior._statistics import holm, mean_interval, paired_difference, ratio_difference
 from neuroprior.behaviour.analysis.drift import action_drift, by_group, by_plan, by_position
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.plans.folds import BLOCKS
 from tests.support.sources import FALSE_ALARM, refuses, seeded
 
@@ -295,3 +296,49 @@ def test_small_bits_are_ranked_too():
     plans = Plans(torch.zeros(8, 4, dtype=torch.long), 2)
     found = [by_plan(plans, bits * scale, plans.mask()).correlations[0] for scale in (1, 1e-3, 1e-12)]
     assert [one.mean for one in found] == [1, 1, 1]
+
+
+def test_fragments_of_a_recording_drift_as_one():
+    """A session with gaps is no other than the same one without: position is measured over all of it, in time."""
+    whole = seeded_plans(12, 40, began=True)
+    bits = torch.rand(12, 40, generator=torch.Generator().manual_seed(4)).double() + whole.began / 300
+    pieces, parts = [], []
+    for r in range(12):
+        edges = [0, 7 + r, 19 + r, 40]
+        pieces += [(r, low, high) for low, high in pairwise(edges)]
+    longest = max(high - low for _, low, high in pieces)
+    fields: dict[str, list[torch.Tensor]] = {"actions": [], "began": [], "bits": []}
+    for r, low, high in pieces:
+        pad = (0, longest - (high - low))
+        for name, values in (("actions", whole.actions.long()), ("began", whole.began), ("bits", bits)):
+            fields[name].append(torch.nn.functional.pad(values[r, low:high], pad))
+        parts.append(high - low)
+    cut = RecordedPlans(
+        torch.stack(fields["actions"]), 3, torch.tensor(parts), group=whole.group[[r for r, *_ in pieces]],
+        recording=[whole.recording[r] for r, *_ in pieces], began=torch.stack(fields["began"]),
+    )  # fmt: skip
+    cut_bits = torch.stack(fields["bits"])
+    same = [(plans, some, plans.mask()) for plans, some in ((whole, bits), (cut, cut_bits))]
+    positions = [by_position(*one) for one in same]
+    assert positions[0].trend == pytest.approx(positions[1].trend)
+    assert positions[0].actions.tolist() == positions[1].actions.tolist()
+    assert by_plan(*same[0]).bits.tolist() == pytest.approx(by_plan(*same[1]).bits.tolist())
+    assert by_group(*same[0]).p_value == pytest.approx(by_group(*same[1]).p_value)
+    assert action_drift(whole)[0].change == pytest.approx(action_drift(cut)[0].change)
+
+
+def seeded_plans(num, length, began=False):
+    generator = torch.Generator().manual_seed(3)
+    steps = torch.rand(num, length, generator=generator, dtype=torch.float64) * torch.arange(1, num + 1)[:, None]
+    return RecordedPlans(
+        torch.randint(3, (num, length), generator=generator), 3, group=torch.arange(num) // 2,
+        recording=[f"day {r % 2}" for r in range(num)], began=steps.cumsum(1) if began else None,
+    )  # fmt: skip
+
+
+def test_positions_are_measured_in_time():
+    """Bits that grow with time do not grow in the same way with the number of actions, where pauses grow."""
+    plans = seeded_plans(8, 30, began=True)
+    low, span = plans.began[:, :1], plans.began[:, -1:] - plans.began[:, :1]
+    found = by_position(plans, 2 + 3 * (plans.began - low) / span, plans.mask())
+    assert found.trend.mean == pytest.approx(3)
