@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from neuroprior.behaviour.reading.frames import are_frames, number_rows, part_of_frames
+from neuroprior.behaviour.reading.frames import are_frames, number_rows, read_labelled_frames
 from neuroprior.behaviour.reading.sequences import strings_of_sequences
 from neuroprior.behaviour.reading.table import MIN_REPEATS, Floats, Part, Table
 from neuroprior.behaviour.reading.times import CLOCKS, Times, over_midnight, smallest_unit
@@ -30,15 +30,18 @@ def rows_of_events(table: Table) -> Part:
     if wrong.size:
         what = f"the stop {stop[wrong[0]]:g} is before the start {start[wrong[0]]:g}"
         table.problems.add(f"`stop` must not be before `start`; {what}", wrong.tolist(), table.place)
-    untimed = np.flatnonzero(np.isnan(start) & (labels != "")) if start_times is not None else np.array([], int)
+    empty = (
+        table.joined(table.roles.at.get("start", [])) == "" if start_times is not None else np.zeros(table.size, bool)
+    )
+    untimed = np.flatnonzero(np.isnan(start) & (labels != "") & empty)
     if untimed.size and untimed.size < table.size:
         table.problems.add("`start` must be known, got an empty cell", untimed.tolist(), table.place)
     if start_times is not None:
         table.split_sessions(start, labels, stop if np.isfinite(stop).any() else None)
         if np.isnan(stop).all() and are_frames(table, start, labels):
-            return part_of_frames(table, start, labels)
+            return read_labelled_frames(table, start, labels)
     elif np.isnan(stop).all() and table.roles.program and table.roles.program.layout == "rows of frames":
-        return part_of_frames(table, number_rows(table), labels)
+        return read_labelled_frames(table, number_rows(table), labels)
     twice = _repeated_rows(table, start, stop)
     if twice.any():
         table.first_notes.append(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from neuroprior.behaviour.reading.names import DEEPETHOGRAM, NAMES, PROGRAMS, SIMBA, WORDS, Program, plain
+from neuroprior.behaviour.reading.names import DEEPETHOGRAM, NAMES, PROGRAMS, SIMBA, SUMMARY, WORDS, Program, plain
 from neuroprior.behaviour.reading.problems import ReadingError
 from neuroprior.behaviour.reading.sheets import Sheet
 from neuroprior.behaviour.reading.times import count_times
@@ -146,6 +146,9 @@ def find_roles(sheet: Sheet, columns: Columns, words: Mapping[str, str]) -> Role
     for use in ("event_type", "start", "stop", "duration", "recording", "subject", "observer", "factors", "context"):
         if use not in closed:
             _find_use(sheet, roles, use, words)
+    if "start" in roles.found and program is None:
+        _add_dates(sheet, roles)
+    _add_factors_above(sheet, roles, closed)
     _choose_behaviour(sheet, roles, "behaviour" in ranges, closed)
     _choose_layout(sheet, roles, words)
     if roles.layout == "rows of sequences":
@@ -160,6 +163,8 @@ def find_roles(sheet: Sheet, columns: Columns, words: Mapping[str, str]) -> Role
                 [group],
                 [one for one in roles.at.get("factors", []) if one != group],
             )
+    if "start" not in named:
+        check_is_no_summary(sheet, roles)
     _note_unused(sheet, roles, words)
     return roles
 
@@ -267,13 +272,14 @@ def _find_use(sheet: Sheet, roles: Roles, use: str, words: Mapping[str, str]) ->
     if use == "event_type":
         kinds = {name: event_words(sheet.frame[name], words) for name in candidates}
         kept = [name for name, kind in kinds.items() if kind == {"start", "stop"} or "lifecycle" in name.lower()]
+        kept = kept or [name for name in sheet.frame if event_words(sheet.frame[name], words) == {"start", "stop"}]
         kept = kept or [name for name in candidates if sorted(sheet.frame[name].unique()) == ["0", "1"]]
     elif use in ("start", "stop", "duration"):
         kept = []
         for name in candidates:
-            times, filled = count_times(sheet.frame[name].to_numpy(object))
-            if filled and times * 2 > filled:
-                kept.append(name)
+            times, digits, filled = count_times(sheet.frame[name].to_numpy(object))
+            if filled and (times * 2 > filled or digits * 2 > filled or (times and name == candidates[0])):
+                kept.append(name)  # what cannot be read in it is an error
             elif filled and name == candidates[0]:
                 roles.notes.append(f"the column {name!r} holds no times, and is not used as {use}")
         if use == "stop" and "start" not in roles.at:
@@ -288,9 +294,58 @@ def _find_use(sheet: Sheet, roles: Roles, use: str, words: Mapping[str, str]) ->
             kept = [name for name in kept if sheet.frame[name].nunique() <= MAX_OBSERVERS]
         elif candidates and not kept:
             roles.notes.append(f"the column {candidates[0]!r} is empty, and not used as {use}")
+        if use == "recording":
+            kept = _finest(sheet, kept, roles)
     if kept:
-        roles.at[use] = kept if use in ("factors", "context") else kept[:1]
+        roles.at[use] = kept if use in ("factors", "context", "recording") else kept[:1]
         roles.found.add(use)
+
+
+def _finest(sheet: Sheet, names: list[str], roles: Roles) -> list[str]:
+    """Return the columns that tell recordings apart: the first, and those that divide its recordings.
+
+    Columns by which each row would be a recording of its own, such as trials of one choice, are left out with a note.
+    """
+    chosen: list[str] = []
+    for name in names:
+        groups = sheet.frame.groupby([*chosen, name], sort=False).ngroups
+        before = sheet.frame.groupby(chosen, sort=False).ngroups if chosen else 0
+        if len(sheet.frame) > 2 and groups == len(sheet.frame):
+            roles.notes.append(f"the column {name!r} differs in each row, and is not used as recording")
+        elif groups > before:
+            chosen.append(name)
+    return chosen
+
+
+def _add_dates(sheet: Sheet, roles: Roles) -> None:
+    """Put a column of dates before times of day, so that days do not lie upon one another."""
+    plains = {plain(name): name for name in reversed(sheet.frame.columns)}
+    dates = [plains[name] for name in NAMES["date"] if name in plains and plains[name] not in roles.used()]
+    start = sheet.frame[roles.at["start"][0]]
+    words = pd.Series(pd.unique(start[start != ""])[:100], dtype=object)
+    if (
+        not dates
+        or not len(words)
+        or not words.str.fullmatch(r"\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?( ?[ap]m)?", case=False).all()
+    ):
+        return
+    times, _, filled = count_times(sheet.frame[dates[0]].to_numpy(object))
+    if filled and times == filled:
+        for use in ("start", "stop"):
+            if use in roles.found:
+                roles.at[use] = [dates[0], *roles.at[use]]
+        roles.notes.append(f"times are those of the days in {dates[0]!r}")
+
+
+def _add_factors_above(sheet: Sheet, roles: Roles, closed: set[str]) -> None:
+    """Take factors that stand above the header as columns."""
+    if "factors" in closed:
+        return
+    for name, value in sheet.above.items():
+        if plain(name) in NAMES["factors"] and value and name not in sheet.frame:
+            sheet.frame[name] = value
+            roles.at["factors"] = [*roles.at.get("factors", []), name]
+            roles.found.add("factors")
 
 
 def _contexts(sheet: Sheet, roles: Roles) -> list[str]:
@@ -317,7 +372,7 @@ def _choose_behaviour(sheet: Sheet, roles: Roles, is_range: bool, closed: set[st
         if "behaviour" not in roles.found and len(names) > 1:
             in_range = is_range or _is_numbered(names)
             zeros = all(_is_indicator(frame[name]) for name in names)
-            if zeros and not (in_range and _is_numbered(names)):
+            if zeros and not (is_range and _is_numbered(names) and not _are_channels(sheet, roles, names)):
                 roles.layout = "columns of behaviours"
             elif in_range or (len(names) >= MIN_WIDE and "start" not in roles.at and _share_labels(frame, names)):
                 roles.layout = "rows of sequences"
@@ -326,10 +381,12 @@ def _choose_behaviour(sheet: Sheet, roles: Roles, is_range: bool, closed: set[st
     plains = {plain(name): name for name in reversed(free)}
     known = [plains[name] for name in NAMES["behaviour"] if name in plains]
     known = [name for name in known if not len(frame) or frame[name].ne("").any()]
-    known = [name for name in known if not _is_measured(frame[name]) and not _is_indicator(frame[name], strict=True)]
+    known = [name for name in known if not _is_measured(frame[name])]
     if "behaviour" in closed and roles.program and roles.program.layout == "columns of behaviours":
         known = []
     wide = _numbered_run(frame, free) if roles.program is None else []
+    if wide and all(_is_indicator(frame[name]) for name in wide) and _are_channels(sheet, roles, wide):
+        wide = []
     if wide and (not known or len(wide) > 5 or _names_behaviours(wide)):
         roles.at["behaviour"], roles.layout = wide, "rows of sequences"
     elif known:
@@ -357,9 +414,9 @@ def _choose_behaviour(sheet: Sheet, roles: Roles, is_range: bool, closed: set[st
     roles.found.add("behaviour")
 
 
-def _is_indicator(column: "pd.Series[Any]", strict: bool = False) -> bool:
+def _is_indicator(column: "pd.Series[Any]") -> bool:
     values = {str(text).lower() for text in pd.unique(column)}
-    return values <= INDICATORS and (not strict or len(values - {""}) == 2) and bool(values - {""})
+    return values <= INDICATORS and bool(values - {""})
 
 
 def _is_measured(column: "pd.Series[Any]") -> bool:
@@ -379,6 +436,15 @@ def _indicator_columns(frame: Any, free: list[str]) -> list[str]:
     chosen = [name for name in names if f"Probability_{name}" in frame.columns]
     names = chosen or names
     return names if any(frame[name].isin(["1", "1.0", "True", "true"]).any() for name in names) else []
+
+
+def _are_channels(sheet: Sheet, roles: Roles, names: list[str]) -> bool:
+    """Whether columns of zeros and ones are behaviours of frames, and not steps of a sequence a row.
+
+    Frames have a time; or one behaviour each.
+    """
+    ones = sum(sheet.frame[name].isin(["1", "1.0", "True", "true"]).astype(int) for name in names)
+    return "start" in roles.at or float((ones == 1).mean()) > 0.95
 
 
 def _is_numbered(names: list[str]) -> bool:
@@ -447,10 +513,27 @@ def _only_label(frame: Any, free: list[str]) -> str | None:
     for name in free:
         words = frame[name][frame[name] != ""]
         number = pd.to_numeric(words, errors="coerce").notna().mean() if len(words) else 1
-        times, filled = count_times(words.to_numpy(object))
+        times, _, filled = count_times(words.to_numpy(object))
         if number < 0.5 and times * 2 < max(filled, 1) and 1 < words.nunique() <= max(2, len(words) // 3):
             texts.append(name)
     return texts[0] if len(texts) == 1 else None
+
+
+def check_is_no_summary(sheet: Sheet, roles: Roles) -> None:
+    """Refuse a table of totals and means, which holds no events.
+
+    Raises:
+        ReadingError: no time is known, and a column that is not used is called a total, a mean or a number.
+    """
+    if roles.layout != "events" or {"start", "stop", "duration"} & roles.at.keys():
+        return
+    totals = [name for name in sheet.frame if name not in roles.used() and SUMMARY.search(plain(name))]
+    numbers = [name for name in totals if pd.to_numeric(sheet.frame[name], errors="coerce").notna().any()]
+    if numbers:
+        raise ReadingError(
+            f"{sheet.name}: a row must be an event, got a table of totals (column {numbers[0]!r}); export the events,"
+            " or say --columns.start none if rows are events in their order"
+        )
 
 
 def _choose_layout(sheet: Sheet, roles: Roles, words: Mapping[str, str]) -> None:

@@ -1,5 +1,6 @@
-"""Rows of frames: with one label, or with a column of zeros and ones for each behaviour."""
+"""Rows of frames: with labels, or with a column of zeros and ones for each behaviour."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -8,12 +9,16 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from neuroprior.behaviour.reading.table import MIN_REPEATS, Floats, Part, Table
+from neuroprior.behaviour.reading.times import smallest_unit
 
 TOGETHER = "+"
 """Between behaviours that are done at once."""
 
-UNSCORED = "\1"
-"""In place of the label of a frame that nobody scored; numpy would drop a zero."""
+MIN_REGULAR = 0.9
+"""Share of steps between rows that are equal, at least, where rows are frames."""
+
+MAX_CHANNEL_LABELS = 40
+"""Labels of a column beside that of the behaviours, at most, where it is another channel of them."""
 
 
 def number_rows(table: Table) -> Floats:
@@ -28,66 +33,68 @@ def are_frames(table: Table, start: Floats, labels: NDArray[Any]) -> bool:
         return True
     unit = table.unit_codes()
     same = np.diff(unit) == 0
-    steps = np.diff(start)[same]
-    if len(steps) < 5:
+    if same.sum() < 5:
         return False
-    step = float(np.nanmedian(steps))
-    regular = step > 0 and float((np.abs(steps - step) < 0.02 * step).mean()) > 0.9
     repeats = float((labels[1:] == labels[:-1])[same].mean())
-    return regular and repeats > MIN_REPEATS
+    return _usual_step(table, np.diff(start)[same]) is not None and repeats > MIN_REPEATS
 
 
-def part_of_frames(table: Table, start: Floats, labels: NDArray[Any]) -> Part:
-    """Read rows of frames: a run of one label is one bout, from its first frame to the one after its last."""
+def _usual_step(table: Table, steps: Floats) -> float | None:
+    """Return the step between frames, to the rounding of their times; None where steps differ."""
+    if not len(steps):
+        return None
+    step = float(np.median(steps))
+    rounding = (
+        smallest_unit(table.frame[table.roles.at["start"][-1]].to_numpy(object)) if table.roles.at.get("start") else 0
+    )
+    near = np.abs(steps - step) <= max(0.02 * step, min(1.01 * rounding, 0.5 * step))
+    if step <= 0 or near.mean() <= MIN_REGULAR:
+        return None
+    return float(np.mean(steps[near]))
+
+
+def read_channels(table: Table, start: Floats, channels: Sequence[NDArray[Any]], lost: NDArray[np.bool_]) -> Part:
+    """Read frames: in each channel a run of one label is a bout, from its first frame to the one after its last.
+
+    Args:
+        table: the table.
+        start: float64 `[rows]`, when each frame begins.
+        channels: `[rows]` each, labels; "" where nothing is done.
+        lost: bool `[rows]`, frames of which nothing is known.
+    """
     unit = table.unit_codes()
     order = np.lexsort((np.arange(table.size), start, unit))
-    unit, when, label = unit[order], start[order], labels[order]
+    unit, when, lost = unit[order], start[order], lost[order]
     same = np.diff(unit) == 0
-    steps = np.diff(when)[same]
-    step = float(np.median(steps)) if len(steps) else 1.0
-    regular = len(steps) > 0 and float((np.abs(steps - step) < 0.02 * max(step, 1e-12)).mean()) > 0.9
+    step = _usual_step(table, np.diff(when)[same])
     begin = np.append(True, ~same)
-    hole = np.zeros(len(order), bool)
-    if regular:
-        hole[1:] = same & (np.diff(when) > 1.5 * step)
-    new = begin | hole | np.append(True, label[1:] != label[:-1])
     after = np.append(when[1:], np.nan)
-    after[np.append(~same, True)] = (when + (step if regular else 0.0))[np.append(~same, True)]
-    if regular:
+    ends = np.append(~same, True)
+    after[ends] = when[ends] + (step or 0.0)
+    if step is not None:
+        hole = np.append(False, same & (np.diff(when) > 1.5 * step))
         after[:-1][hole[1:]] = when[:-1][hole[1:]] + step
-    first = np.flatnonzero(new)
-    last = np.append(first[1:] - 1, len(order) - 1)
-    rows = order[first]
-    words = (
-        table.frame[table.roles.at["behaviour"][0]].to_numpy(object)[rows]
-        if len(table.roles.at["behaviour"]) == 1
-        else label[first]
-    )
-    # An empty cell says that nothing was done; a word for missing, that nobody knows.
-    blank = (label[first] == "") & ((words == "") | (table.options.missing == "nothing"))
-    start_of, stop_of = when[first], after[last]
-    cut = hole[first]
-    lost = ((label[first] == "") & ~blank) | (label[first] == UNSCORED)
-    cut = cut | np.append(False, lost[:-1])
-    keep = (label[first] != "") & ~lost
-    carried = np.maximum.accumulate(np.where(cut, np.arange(len(first)), -1))
-    previous = np.append(-1, np.flatnonzero(keep))
-    cut_kept = carried[keep] > previous[:-1][: keep.sum()]
-    table.notes.append(
-        f"each row is a frame of {step:g} {table.unit or 'in the unit of the time'}: runs of one label are read"
-        " as bouts"
-        if regular
-        else "rows say when something changes: a label lasts until the next row"
-    )
-    if blank.any():
-        table.notes.append("frames with an empty cell were watched, and nothing was scored in them")
-    part = table.part(rows[keep], label[first][keep], start_of[keep], stop_of[keep], cut_kept)
+        begin |= hole
+        unit_name = table.unit or "in the unit of the time"
+        table.notes.append(f"each row is a frame of {step:.4g} {unit_name}: runs of one label are read as bouts")
+    else:
+        table.notes.append("rows say when something changes: a label lasts until the next row")
+    stretch = np.cumsum(begin | np.append(False, lost[1:] != lost[:-1]))
+    found: list[tuple[Any, ...]] = []
+    for labels in channels:
+        label = labels[order]
+        first = np.flatnonzero(np.append(True, (label[1:] != label[:-1]) | (np.diff(stretch) != 0)))
+        last = np.append(first[1:] - 1, len(order) - 1)
+        kept = (label[first] != "") & ~lost[first]
+        first, last = first[kept], last[kept]
+        found.append((order[first], label[first], when[first], after[last], stretch[first]))
+    rows, names, starts, stops, stretches = (np.concatenate(columns) for columns in zip(*found, strict=True))
+    part = table.part(rows.astype(np.int64), names, starts, stops, stretches)
     # What was watched does not begin with the first behaviour, but with the first frame.
-    stretch = np.cumsum(begin[first] | cut)[~lost]
     seen = pd.DataFrame({
-        "recording": table.recording[rows][~lost], "subject": table.subject[rows][~lost], "stretch": stretch,
-        "start": start_of[~lost], "stop": stop_of[~lost],
-    })  # fmt: skip
+        "recording": table.recording[order], "subject": table.subject[order], "stretch": stretch,
+        "start": when, "stop": after,
+    })[~lost]  # fmt: skip
     spans = seen.groupby("stretch", sort=False).agg(
         recording=("recording", "first"), subject=("subject", "first"), start=("start", "min"), stop=("stop", "max")
     )
@@ -103,7 +110,53 @@ def rows_of_frames(table: Table) -> Part:
         table.unit = "frames"
     else:
         table.split_sessions(start, labels)
-    return part_of_frames(table, start, labels)
+    return read_labelled_frames(table, start, labels)
+
+
+def read_labelled_frames(table: Table, start: Floats, labels: NDArray[Any]) -> Part:
+    """Read frames with a label each, and with other columns of labels as further channels.
+
+    An empty cell says that nothing was done; a word for missing, that nobody knows.
+    """
+    names = table.roles.at["behaviour"]
+    blank = table.joined(names) == ""
+    lost = (labels == "") & ~blank & (table.options.missing == "gap")
+    others = _other_channels(table) if "behaviour" in table.roles.found else {}
+    channels = [labels]
+    if others:
+        called = {names[0]: labels, **{name: table.labels(table.frame[name].to_numpy(object)) for name in others}}
+        sets = [set(pd.unique(one)) - {""} for one in called.values()]
+        shared = sum(map(len, sets)) > len(set().union(*sets))
+        if shared:  # the same label in two channels is not the same behaviour
+            called = {
+                name: np.array([label and f"{name}: {label}" for label in one], object) for name, one in called.items()
+            }
+        channels = list(called.values())
+        table.roles.at["behaviour"] = list(called)
+        table.first_notes.append(f"the columns {', '.join(called)} hold labels at each frame: each is read for itself")
+        lost = np.zeros(table.size, bool)
+    elif blank.any():
+        table.notes.append("frames with an empty cell were watched, and nothing was scored in them")
+    return read_channels(table, start, channels, lost)
+
+
+def _other_channels(table: Table) -> list[str]:
+    """Return columns without a use that hold a few labels in runs, as that of the behaviours does."""
+    used = table.roles.used()
+    unit = table.unit_codes()
+    same = np.diff(unit) == 0
+    found = []
+    for name in table.frame:
+        cells = table.frame[name]
+        words = pd.unique(cells[cells != ""])
+        if name in used or not 1 <= len(words) <= MAX_CHANNEL_LABELS:
+            continue
+        is_text = pd.to_numeric(pd.Series(words, dtype=object), errors="coerce").isna().all()
+        values = cells.to_numpy(object)
+        changes = (values[1:] != values[:-1])[same]
+        if is_text and changes.any() and (~changes).mean() > MIN_REPEATS:
+            found.append(str(name))
+    return found
 
 
 def columns_of_behaviours(table: Table) -> Part:
@@ -111,7 +164,7 @@ def columns_of_behaviours(table: Table) -> Part:
     names = table.roles.at["behaviour"]
     values = [table.frame[name].str.lower().to_numpy(object) for name in names]
     on = np.stack([np.isin(value, ["1", "1.0", "true"]) for value in values], 1)
-    unscored = np.logical_and.reduce([np.isin(value, ["-1", "-1.0"]) for value in values])
+    unscored = np.logical_and.reduce([np.isin(value, ["-1", "-1.0", ""]) for value in values])
     times = table.times("start")
     index = table.frame.columns[0]
     if times is None and index.startswith("(column ") and index not in names:
@@ -126,44 +179,21 @@ def columns_of_behaviours(table: Table) -> Part:
     if never:
         table.notes.append(f"behaviours that never occur: {', '.join(never)}")
     if unscored.any():
-        table.notes.append(f"{int(unscored.sum()):,} rows are -1 in all columns: they were not scored")
+        table.notes.append(f"{int(unscored.sum()):,} rows are empty or -1 in all columns: they were not scored")
     table.split_sessions(start, on.argmax(1).astype(str).astype(object))
-    if several and table.options.overlaps != "join":
-        table.first_notes.append(
-            f"{several:,} of {table.size:,} rows have several behaviours at once; each is read for itself"
-            " (--overlaps join"
-            " reads them as one)"
-        )
-        return _separate_behaviours(table, on, unscored, start, shown)
+    if table.options.overlaps != "join":
+        if several:
+            table.first_notes.append(
+                f"{several:,} of {table.size:,} rows have several behaviours at once; each is read for itself"
+                " (--overlaps join reads them as one)"
+            )
+        channels = [np.where(column, name, "").astype(object) for name, column in zip(shown, on.T, strict=True)]
+        return read_channels(table, start, channels, unscored)
     kinds, inverse = np.unique(on, axis=0, return_inverse=True)
     words = [TOGETHER.join(name for name, yes in zip(shown, kind, strict=True) if yes and name) for kind in kinds]
-    labels = np.array(words, dtype=object)[inverse.ravel()]
     if several:
         some = next(word for word in words if TOGETHER in word)
         table.first_notes.append(
-            f"{several:,} of {table.size:,} rows have several behaviours, read as one, such as {some!r}"
+            f"{several:,} of {table.size:,} rows have several behaviours, read as one, as {some!r}"
         )
-    return part_of_frames(table, start, np.where(unscored, UNSCORED, labels))
-
-
-def _separate_behaviours(
-    table: Table, on: NDArray[np.bool_], unscored: NDArray[np.bool_], start: Floats, names: list[str]
-) -> Part:
-    parts = []
-    for i, name in enumerate(names):
-        labels = np.where(unscored, UNSCORED, np.where(on[:, i], name, "")).astype(object)
-        parts.append(part_of_frames(table, start, labels))
-    table.notes = list(dict.fromkeys(table.notes))
-    events = pd.concat([one.events for one in parts], ignore_index=True)
-    rows = np.concatenate([one.rows for one in parts])
-    order = events.assign(_row=rows).sort_values(["recording", "subject", "start"], kind="stable").index.to_numpy()
-    events, rows = events.iloc[order].reset_index(drop=True), rows[order]
-    spans = parts[0].spans
-    assert spans is not None
-    owners = pd.concat([spans, events], ignore_index=True)
-    unit = pd.factorize(owners["recording"] + "\0" + owners["subject"])[0]
-    width = float(owners["start"].max() - owners["start"].min()) + 1
-    place = unit * width + (owners["start"] - owners["start"].min()).to_numpy()
-    order = np.argsort(place[: len(spans)], kind="stable")
-    fragment = order[np.searchsorted(place[: len(spans)][order], place[len(spans) :], "right") - 1]
-    return replace(parts[0], events=events, fragment=fragment.astype(np.int64), rows=rows, notes=table.notes)
+    return read_channels(table, start, [np.array(words, dtype=object)[inverse.ravel()]], unscored)

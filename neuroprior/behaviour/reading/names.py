@@ -1,6 +1,7 @@
 """Names of columns that are known: what each usually holds, and the exports of programs."""
 
 import re
+import unicodedata
 from typing import NamedTuple
 
 UNIT_IN_BRACKETS = re.compile(
@@ -20,23 +21,29 @@ NAMES: dict[str, tuple[str, ...]] = {
         "bird id", "individual", "individual id", "focal", "focal animal", "focal subject", "participant",
         "participant id", "person", "person id", "id", "pid", "ind", "individu", "tier", "case concept name", "case id",
         "case", "idhous", "subject name", "tier id",
+        "actor", "initiator", "proband", "sujet", "sujeto",
     ),
     "recording": (
         "recording", "recording id", "session", "session id", "observation", "observation id", "video", "video name",
         "video id", "filename", "file name", "file", "trial", "trial id", "trial name", "notated path", "begin file",
-        "source file", "plan", "plan id", "sequence id", "run", "obs", "case concept name", "case id", "case",
+        "source file", "plan", "plan id", "sequence id", "run", "obs",
+        "versuch", "sitzung", "seance", "sesion", "case concept name", "case id", "case",
     ),
     "start": (
         "start", "start time", "onset", "onset time", "begin", "begin time", "start timestamp", "from", "time relative",
         "time", "timestamp", "time timestamp", "times", "t", "trial time", "recording time", "second", "frame",
         "frame index", "frame number", "frame id", "frames", "beginn", "anfang", "von", "zeit", "debut", "start frame",
-        "begin frame", "onset frame", "time relative hmsf", "time absolute hms", "date time", "datetime", "date",
+        "begin frame", "onset frame", "time relative hmsf", "time absolute hms", "date time", "datetime",
+        "startzeit", "uhrzeit", "inicio", "event start",
+        "start of event", "scan time", "epoch", "heure", "hora", "temps", "tiempo", "datum", "date",
     ),
     "stop": (
         "stop", "stop time", "end", "end time", "offset", "offset time", "finish", "to", "ende", "bis", "fin",
-        "end timestamp", "stop timestamp", "complete timestamp", "end frame", "stop frame", "offset frame",
+        "end timestamp", "stop timestamp", "endzeit", "stopp", "event end", "end of event",
+        "complete timestamp", "end frame", "stop frame", "offset frame",
     ),
-    "duration": ("duration", "bout time", "dur", "bout duration", "bout length", "dauer", "length"),
+    "duration": ("duration", "bout time", "dur", "bout duration", "bout length", "dauer", "duree", "duracion",
+                 "length"),
     "event_type": (
         "event type", "behavior type", "behaviour type", "lifecycle transition", "transition", "type", "status",
         "marker", "state event", "start stop", "on off", "onoff",
@@ -45,6 +52,7 @@ NAMES: dict[str, tuple[str, ...]] = {
         "observer", "observer id", "observer name", "coder", "coder id", "rater", "scorer", "annotator", "annotator id",
     ),
     "context": ("context",),
+    "date": ("date", "datum", "observation date", "date dmy", "fecha", "jour"),
     "factors": (
         "treatment", "condition", "genotype", "sex", "gender", "group", "drug", "dose", "strain", "age", "phase",
         "cohort", "line", "diet", "season", "day", "experimental group", "treatment group",
@@ -60,7 +68,8 @@ def plain(name: str) -> str:
         >>> plain("Start (s)"), plain("case:concept:name"), plain("onset_s")
         ('start', 'case concept name', 'onset')
     """
-    short = UNIT_IN_BRACKETS.sub("", str(name).strip().lower())
+    letters = unicodedata.normalize("NFKD", str(name).strip().lower())
+    short = UNIT_IN_BRACKETS.sub("", "".join(letter for letter in letters if not unicodedata.combining(letter)))
     short = re.sub(r"[\s_.:\-]+", " ", short).strip()
     return UNIT_AT_END.sub("", short)
 
@@ -128,8 +137,8 @@ DEEPETHOGRAM = _program("DeepEthogram, labels", "background", "columns of behavi
 """Programs that are known by how their columns of zeros and ones are named."""
 
 WORDS = {
-    "start": ("start", "state start", "begin", "began", "onset", "on", "started", "state begin", "beginn"),
-    "stop": ("stop", "state stop", "end", "ended", "offset", "off", "stopped", "state end", "complete", "finish",
+    "start": ("start", "state start", "begin", "began", "onset", "on", "started", "state begin", "beginn", "an"),
+    "stop": ("stop", "state stop", "end", "ended", "offset", "off", "stopped", "aus", "state end", "complete", "finish",
              "finished", "completed", "ende"),
     "point": ("point", "instant", "point event", "state point"),
 }  # fmt: skip
@@ -140,6 +149,12 @@ MISSING_WORDS = (
     "#num!",
 )  # fmt: skip
 """What stands for no label, in lower case."""
+
+SUMMARY = re.compile(r"\b(total|mean|median|average|std|sd|number|frequency|occurr?ences)\b")
+"""In the names of columns of tables that sum events up."""
+
+SEQUENCE_MISSING = ("*", "%")
+"""States of TraMineR's sequences that stand for none."""
 
 NO_SUBJECT = ("no focal subject",)
 """What a program writes where no subject was chosen, in lower case."""

@@ -1,6 +1,8 @@
 """Read recordings from files of laboratories."""
 
+from collections import Counter
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -54,6 +56,8 @@ def read_recordings(paths: Any, options: Options) -> Recordings:
     """Read recordings with options; see `read`."""
     assert isinstance(options.columns, Columns)
     wanted = _words_of_columns(options.columns)
+    if isinstance(paths, pd.Series):
+        raise ValueError("`paths` must be files, folders or pandas frames, got a Series; give series.to_frame()")
     one = isinstance(paths, str | pd.DataFrame) or not hasattr(paths, "__iter__")
     groups: list[list[Sheet]] = []
     for number, item in enumerate([paths] if one else list(paths)):
@@ -66,6 +70,7 @@ def read_recordings(paths: Any, options: Options) -> Recordings:
             raise ValueError(f"`paths` must be files, folders or pandas frames, got {type(item).__name__}")
     if not groups:
         raise ValueError("`paths` must have one file at least, got none")
+    _tell_stems_apart(groups)
     parts: list[Part] = []
     notes: list[str] = []
     wrong: list[str] = []
@@ -75,6 +80,15 @@ def read_recordings(paths: Any, options: Options) -> Recordings:
     if wrong:
         raise ReadingError(wrong)
     return _combine(parts, notes, options)
+
+
+def _tell_stems_apart(groups: list[list[Sheet]]) -> None:
+    """Put the folder before the names of files that are the same in several folders."""
+    count = Counter(sheet.stem for sheets in groups for sheet in sheets[:1])
+    for sheets in groups:
+        for sheet in sheets:
+            if count[sheet.stem] > 1 and sheet.is_file:
+                sheet.stem = f"{Path(sheet.name.split(', ')[0]).parent.name}/{sheet.stem}"
 
 
 def _words_of_columns(columns: Columns) -> list[str]:
@@ -147,7 +161,10 @@ def _check_observers(table: Table, part: Part, problems: Problems) -> None:
     if separating:
         own = ",".join(part.roles.at["behaviour"])
         use = f"--columns.observer {separating!r}, or --columns.subject {separating!r}"
-        use = f"--columns.behaviour '{own},{separating}'" if plain(separating).startswith("modifier") else use
+        if plain(separating).startswith("modifier"):
+            use = f"--columns.behaviour '{own},{separating}'"
+        elif plain(separating) in (*NAMES["recording"], *NAMES["factors"], *NAMES["date"]):
+            use = f"--columns.recording '{','.join([*part.roles.at.get('recording', []), separating])}'"
         way = f"the column {separating!r} keeps them apart ({use})"
     event = part.events.iloc[row]
     what = f"{share:.0%} of the bouts overlap another of the same subject and behaviour, such as {event['behaviour']!r}"
@@ -159,12 +176,15 @@ def same_overlap(events: pd.DataFrame) -> tuple[float, int]:
     known = events["stop"].notna().to_numpy() & (events["stop"] > events["start"]).to_numpy()
     if not known.any():
         return 0.0, 0
-    some = events[known].reset_index()
+    some = events[known]
     keys = [key for key in (*KEYS, "behaviour") if key in some]
-    some = some.sort_values([*keys, "start"], kind="stable")
-    latest = some.groupby(keys, sort=False)["stop"].transform(lambda one: one.cummax().shift())
-    late = (some["start"] < latest - 1e-9 * latest.abs() - 1e-9).to_numpy()
-    return float(late.mean()), int(some["index"].to_numpy()[late.argmax()]) if late.any() else 0
+    unit = some.groupby(keys, sort=False).ngroup().to_numpy()
+    start, stop = some["start"].to_numpy(float), some["stop"].to_numpy(float)
+    order = np.lexsort((start, unit))
+    latest = pd.Series(stop[order]).groupby(unit[order]).cummax().to_numpy()
+    before, same = np.append(np.nan, latest[:-1]), np.diff(unit[order], prepend=-1) == 0
+    late = same & (start[order] < before - 1e-9 * np.abs(before) - 1e-9)
+    return float(late.mean()), int(np.flatnonzero(known)[order[late.argmax()]]) if late.any() else 0
 
 
 def _separating_column(table: Table, part: Part) -> str | None:

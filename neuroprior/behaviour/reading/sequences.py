@@ -1,22 +1,27 @@
 """Rows of sequences: a behaviour in each column, or a whole sequence in one cell."""
 
 import re
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from neuroprior.behaviour.reading.names import plain
+from neuroprior.behaviour.reading.names import SEQUENCE_MISSING, plain
 from neuroprior.behaviour.reading.table import MIN_REPEATS, Part, Table
 
 SPS = re.compile(r"\(?([^(),]+),\s*(\d+(?:\.\d+)?)\)?")
-SPLITS = ("-", "|", ";", ",", " ", "/")
+SPLITS = (" > ", "->", "-", "|", ";", ",", " ", "/")
 """Between the behaviours of a sequence that stands in one cell."""
+
+MIN_SPLIT = 0.3
+"""Share of cells with a separator, at least, where cells are sequences."""
 
 
 def rows_of_sequences(table: Table) -> Part:
     """Read one row a sequence, a behaviour in each column; empty cells behind the last one are its end."""
     names = table.roles.at["behaviour"]
     cells = table.frame[names].to_numpy(object)
+    cells = np.where(np.isin(cells, SEQUENCE_MISSING), "", cells)
     labels = table.labels(cells.ravel()).reshape(cells.shape)
     reach = np.where(labels != "", np.arange(1, 1 + len(names)), 0).max(1, initial=0)
     empty = int((reach == 0).sum())
@@ -53,6 +58,12 @@ def rows_of_sequences(table: Table) -> Part:
     return part
 
 
+def _fewest_pieces(texts: Any, separators: list[str]) -> str:
+    """Return the separator by which texts have the fewest different pieces, such as the space in "self-groom rear"."""
+    pieces = {one: len({word.strip() for text in texts for word in text.split(one)}) for one in separators}
+    return min(separators, key=lambda one: pieces[one], default="")
+
+
 def _names_of_rows(table: Table) -> str | None:
     """Return the first column that is not used and holds a name of its own in each row, if there is one."""
     used = table.roles.used()
@@ -69,15 +80,18 @@ def strings_of_sequences(table: Table) -> Part | None:
     filled = cells[cells != ""]
     if not len(filled):
         return None
+    filled = filled.str.replace(r"([^\s/()-]+)/(\d+(?:\.\d+)?)(?=-|$)", r"(\1,\2)", regex=True)
+    cells = cells.where(cells == "", filled.reindex(cells.index))
     timed = filled.str.fullmatch(r"\(?[^(),]+,\s*\d+(\.\d+)?\)?(\s*-\s*\(?[^(),]+,\s*\d+(\.\d+)?\)?)*")
-    own = plain(names[0]) in ("sequence", "seq", "sequences")
+    own = plain(names[0]) in ("sequence", "seq", "sequences") or not table.sheet.header
     separator = ""
     if not (timed.mean() > 0.9):
         keys = pd.Series(list(zip(table.recording, table.subject, strict=True)))
         alone = own or ("subject" in table.roles.at and keys.is_unique)
         counts = {one: float(filled.str.contains(one, regex=False).mean()) for one in SPLITS}
         separator = max(SPLITS, key=lambda one: counts[one])
-        if not alone or counts[separator] <= 0.5:
+        separator = _fewest_pieces(filled, [one for one in SPLITS if counts[one] >= MIN_SPLIT]) or separator
+        if not alone or counts[separator] < MIN_SPLIT:
             return None
         pieces = {word for text in filled for word in text.split(separator)}
         if len(pieces) >= filled.str.count(re.escape(separator)).add(1).sum() * 0.9 and len(filled) > 1:

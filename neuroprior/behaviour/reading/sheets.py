@@ -80,7 +80,7 @@ def find_files(paths: Any) -> list[Path]:
     for one in [paths] if isinstance(paths, str | os.PathLike) else paths:
         path = Path(one)
         if path.is_dir():
-            inside = sorted(file for file in path.iterdir() if _is_table(file))
+            inside = sorted(file for file in path.rglob("*") if _is_table(file))
             if not inside:
                 raise ReadingError(f"{path}: the folder must hold tables ({', '.join(TABLE_SUFFIXES)}), got none")
             found += inside
@@ -212,6 +212,8 @@ def sheet_of_frame(frame: pd.DataFrame, name: str = "table", stem: str = "table"
     """
     if not isinstance(frame, pd.DataFrame):
         raise ReadingError(f"`paths` must be files or pandas frames, got {type(frame).__name__}")
+    if isinstance(frame.index, pd.DatetimeIndex | pd.TimedeltaIndex) and frame.index.name is None:
+        frame = frame.rename_axis("time")
     if any(level is not None for level in frame.index.names):
         frame = frame.reset_index()
     if isinstance(frame.columns, pd.MultiIndex):
@@ -260,7 +262,8 @@ def _sheet_of_text(content: bytes, label: str, stem: str, wanted: Sequence[str])
             io.StringIO(text), sep=separator, skiprows=skipped, skip_blank_lines=False, index_col=False, **options
         )
     except (pd.errors.ParserError, pd.errors.EmptyDataError) as error:
-        raise ReadingError(f"{label}: the file must be a table, got text that is none ({error})") from None
+        what = "a quote that is not closed" if "inside string" in str(error) else f"text that is none ({error})"
+        raise ReadingError(f"{label}: the file must be a table, got {what}") from None
     for column in cells:
         cells[column] = _stripped(cells[column])
     numbers = np.arange(len(cells)) + 1 + skipped
@@ -338,7 +341,9 @@ def _separator(lines: Sequence[str], wanted: Sequence[str]) -> str:
         regular = times / len(rows) if width > 1 else 0.0
         if separator == " " and (regular < 1 or best_rank > (0, 0.5)):
             continue
-        rank = (float(named), regular * min(width, 50) ** 0.1)
+        last = rows[-1] if width > 1 else []
+        numbers = sum(map(_is_number, last)) / max(len(last), 1)
+        rank = (float(named), regular * min(width, 50) ** 0.1 + 0.5 * numbers)
         if width > 1 and rank > best_rank:
             best, best_rank = separator, rank
     return best
@@ -355,6 +360,14 @@ def _sheet_of_cells(
     comment = cells[0].str.startswith("\\").to_numpy()  # the frequencies of Audacity's labels
     if comment.any() and not comment.all():
         cells, lines = cells[~comment].reset_index(drop=True), lines[~comment]
+    remark = cells[0].str.startswith("#").to_numpy()
+    above = int(np.argmin(remark)) if remark.any() and not remark.all() else 0
+    if above and not (
+        above == 1 and cells.iloc[0].ne("").sum() > 1 and cells.iloc[0].ne("").sum() == cells.iloc[1].ne("").sum()
+    ):
+        cells, lines = cells.iloc[above:].reset_index(drop=True), lines[above:]
+        cells = cells.loc[:, cells.ne("").any(axis=0)]
+        cells.columns = pd.RangeIndex(cells.shape[1])
     sheet = Sheet(name, stem, cells, lines, separator=separator)
     top = cells.head(MAX_LINES_ABOVE).to_numpy(dtype=object).tolist()
     at, header = _find_header(top, cells, wanted)
@@ -426,7 +439,7 @@ def _find_header(top: list[list[str]], cells: Any, wanted: Sequence[str]) -> tup
     usual = int(np.bincount(rows[rows > 0]).argmax()) if rows.size else 0
     for at, row in enumerate(top):
         words = [cell for cell in row if cell]
-        if len(set(words)) < len(words) or (widths[at] < max(usual - 2, 2) and usual > 1 and known[at] < 2):
+        if known[at] < 2 and (len(set(words)) < len(words) or (widths[at] < max(usual - 2, 2) and usual > 1)):
             continue
         above = at > 0 and not _is_header(row, cells, at) and known[at] < 2
         if above and widths[at] >= usual:
@@ -452,10 +465,12 @@ def _ethovision_header(top: list[list[str]], count: int) -> int:
 def _is_header(row: list[str], cells: Any, at: int) -> bool:
     """Whether a line names columns: by words that are known, by its numbers, or since it is unlike the rows below."""
     words = [cell for cell in row if cell]
-    if not words or len(set(words)) < len(words):
+    if not words:
         return False
     if sum(plain(cell) in KNOWN_NAMES for cell in words) >= min(2, len(words)) and not all(map(_is_number, words)):
         return True
+    if len(set(words)) < len(words):
+        return False
     if any(re.fullmatch(r"-?\d+[.,]\d+|\d+:\d\d(:\d\d.*)?", word) for word in words) and not all(
         map(_is_number, words)
     ):

@@ -247,6 +247,8 @@ class Table:
         span = (again["before"] - again["lowest"]).clip(lower=0)
         restarts = (again["low"] - again["lowest"] <= 0.5 * span) & (again["kinds"] > 1) & (again["size"] >= 3)
         if not len(again) or restarts.mean() < 0.9:
+            row = int(np.flatnonzero(block == again.index[0])[0])
+            self.notes.append(f"rows are not in the order of time (first {self.place(row)}), and are put in it")
             return
         if stop is not None and not overlaps(unit, start, stop) > MAX_OVERLAP:
             return
@@ -270,7 +272,7 @@ class Table:
         )
 
     def part(
-        self, rows: Integers, labels: NDArray[Any], start: Floats, stop: Floats, cut: NDArray[np.bool_] | None = None
+        self, rows: Integers, labels: NDArray[Any], start: Floats, stop: Floats, stretch: Integers | None = None
     ) -> Part:
         """Return the events of rows, in the order of their recordings and of time.
 
@@ -278,7 +280,7 @@ class Table:
             rows: int `[events]`.
             labels: `[events]`, "" where none is known: what follows is another fragment.
             start, stop: float64 `[events]`.
-            cut: bool `[events]`, True where a fragment begins; None: after events without a label.
+            stretch: int `[events]`, in which stretch of its recording each is, between two gaps; None: in one.
         """
         events = pd.DataFrame({
             "recording": self.recording[rows], "subject": self.subject[rows], "behaviour": labels,
@@ -300,8 +302,8 @@ class Table:
         begin = np.zeros(len(events), bool)
         for codes in appear:
             begin |= np.diff(codes[order], prepend=-1) != 0
-        if cut is not None:
-            begin |= cut[order]
+        if stretch is not None:
+            begin |= np.diff(stretch[order], prepend=-1) != 0
         missing = events["behaviour"].eq("").to_numpy()
         begin[1:] |= missing[:-1]
         fragment = np.cumsum(begin | missing) - 1

@@ -11,11 +11,11 @@ from neuroprior.behaviour.reading.problems import Place, Problems
 
 Floats = NDArray[np.float64]
 
-CLOCK = r"(-?)(?:(\d+):)?(\d+):(\d+(?:[.,]\d*)?)"
+CLOCK = r"(-?)(?:(\d+):)?(\d+):(\d+(?:[.,]\d*)?)(?: ?([AaPp])[Mm])?"
 DAYS = r"(-?\d+) days?,? ?(?:\+?(\d+):(\d+):(\d+(?:\.\d*)?))?"
 YEAR_FIRST = r"\d{4}([-/.])\d{1,2}\1\d{1,2}(?:[T ]\S.*)?"
 YEAR_LAST = r"(\d{1,2})[-/. ](\d{1,2})[-/. ](\d{4}|\d{2})(?:[T, ]+(\S.*))?"
-MISSING_TIMES = ("", "na", "nan", "n/a", "null", "none", "nat", "-", "<na>")
+MISSING_TIMES = ("", "na", "nan", "n/a", "null", "none", "nat", "-", "<na>", "?", "n.a.")
 THOUSANDS = r"-?\d{1,3}(,\d{3})+(\.\d*)?"
 
 NUMBERS, CLOCKS, DATES = "numbers", "times of day", "dates"
@@ -61,6 +61,7 @@ def read_times(
     words = pd.Series(unique, dtype=object)
     missing = words.str.lower().isin(MISSING_TIMES)
     numbers = pd.to_numeric(words.where(~missing), errors="coerce")
+    words, numbers = _without_thousands(words, numbers, missing, separator)
     commas = words[numbers.isna() & ~missing]
     if len(commas) and commas.str.fullmatch(r"-?\d*,\d+").all():
         if separator == "," and commas.str.fullmatch(THOUSANDS).all():
@@ -80,13 +81,30 @@ def read_times(
     return Times(_date_seconds(rest, ~missing, codes, unique, use, place, problems, day_first)[codes], DATES)
 
 
-def count_times(texts: NDArray[Any]) -> tuple[int, int]:
-    """Return how many of some texts (the first `SAMPLE` that differ) hold times of any kind, and how many anything."""
+def _without_thousands(words: Any, numbers: Any, missing: Any, separator: str) -> tuple[Any, Any]:
+    """Return texts and numbers without marks between thousands, where these cannot be decimal marks."""
+    rest = words[numbers.isna() & ~missing]
+    if len(rest) and rest.str.fullmatch(r"-?\d{1,3}(,\d{3})+\.\d+").any() and rest.str.fullmatch(THOUSANDS).all():
+        words = words.str.replace(",", "", regex=False)
+    elif len(rest) and separator != "," and rest.str.fullmatch(r"-?\d{1,3}(\.\d{3})+,\d+").any():
+        if not rest.str.fullmatch(r"-?(\d{1,3}(\.\d{3})+|\d+)(,\d+)?").all():
+            return words, numbers
+        words = words.str.replace(".", "", regex=False).str.replace(",", ".", regex=False)
+    else:
+        return words, numbers
+    return words, pd.to_numeric(words.where(~missing), errors="coerce")
+
+
+def count_times(texts: NDArray[Any]) -> tuple[int, int, int]:
+    """Return how many of some texts are times of any kind, how many have a digit, and how many hold anything.
+
+    The first `SAMPLE` texts that differ are looked at.
+    """
     words = pd.Series(pd.unique(np.asarray(texts, dtype=object))[:SAMPLE], dtype=object)
     words = words[~words.str.lower().isin(MISSING_TIMES)]
     number = pd.to_numeric(words.str.replace(",", ".", regex=False), errors="coerce").notna()
     other = words.str.fullmatch(f"{CLOCK}|{DAYS}|{YEAR_LAST}") | words.str.fullmatch(YEAR_FIRST)
-    return int((number | other).sum()), len(words)
+    return int((number | other).sum()), int(words.str.contains(r"\d").sum()), len(words)
 
 
 def _complain(
@@ -117,6 +135,8 @@ def _clock_seconds(
     if two.any() and not (parts[3][two].str.contains("[.,]") | (minutes[two] > 23)).any():
         right = "a time as h:m:s; two numbers may be hours and minutes, or minutes and seconds"
         _complain(problems, place, codes, unique, two, use, right)
+    half = parts[4].str.lower()
+    hours = hours.where(half.isna(), hours % 12 + 12 * (half == "p"))
     values = sign * (3600 * hours.fillna(0) + 60 * minutes + seconds)
     values = values.where((seconds < 60) & (hours.isna() | (minutes < 60)))
     whole = days.astype(float).fillna(0)
