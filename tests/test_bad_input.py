@@ -161,7 +161,7 @@ def test_numbers_of_numpy_are_numbers():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["report", "FILE", "--columns.acton", "x"], ["columns", "'acton'"]),
+        (["report", "FILE", "--columns.acton", "x"], ["columns.acton"]),
         (["fit", "FILE", "--config", "markov", "--prior.hidden", "8"], ["prior", "'hidden'"]),
         (["sample", "PRIOR", "--seed", str(2**70)], ["seed", "2**63"]),
         (["score", "PRIOR", "FILE", "--out", "OUT"], ["at least two held-out actions"]),

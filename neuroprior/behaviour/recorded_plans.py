@@ -219,6 +219,7 @@ def plans_of_events(
         return torch.from_numpy(padded(np.array(values), lengths, "recordings"))
 
     group, subjects = pd.factorize(first["subject"], sort=True)
+    alone = len(subjects) == len(first) and bool((events["subject"] == events["recording"]).all())
     begun = events["start"].to_numpy(np.float64)
     seconds = (events["stop"] - events["start"]).to_numpy(np.float32)
     fields: dict[str, Any] = _context_fields(context, events, wide, notes)
@@ -232,8 +233,9 @@ def plans_of_events(
         count,
         None if (lengths == lengths.max()).all() else torch.from_numpy(lengths),
         names,
-        group=torch.from_numpy(group.astype(np.int64)),
-        group_names=tuple(map(str, subjects)),
+        # Recordings of which no subject is known, and which have no gaps, are plans that are independent.
+        group=None if alone else torch.from_numpy(group.astype(np.int64)),
+        group_names=None if alone else tuple(map(str, subjects)),
         recording=tuple(first["recording"]),
         began=None if np.isnan(begun).all() else wide(begun),
         durations=None if np.isnan(seconds).all() else wide(seconds),

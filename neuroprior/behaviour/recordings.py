@@ -52,6 +52,13 @@ class Recordings:
         sources: what was read.
         empty: recordings without any event.
         spans: when each recording was watched, where files say it (see `watched`); None: from the events.
+
+    Example:
+        >>> import pandas as pd
+        >>> table = {"animal": ["m1"] * 3, "behaviour": ["rest", "walk", "rest"], "start": [0, 5, 7], "stop": [5, 7, 9]}
+        >>> recordings = read(pd.DataFrame(table))
+        >>> recordings.time_budget().loc["m1", "walk"].round(2)
+        np.float64(0.22)
     """
 
     events: pd.DataFrame

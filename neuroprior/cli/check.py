@@ -7,7 +7,8 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
-from neuroprior.behaviour.reading import Options, ReadingError, read_recordings
+from neuroprior.behaviour.reading import Options, ReadingError
+from neuroprior.behaviour.reading.read import read_recordings
 from neuroprior.behaviour.recordings import Recordings, Source
 from neuroprior.cli.reading import reading_words
 

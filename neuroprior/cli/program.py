@@ -129,6 +129,8 @@ def make_parser(function: Callable[..., Any], program: str, skip: Collection[str
     skipped = {*items, *skip, *(reading[:1] if reading else ())}
     parser.add_function_arguments(function, as_group=False, as_positional=True, skip=skipped)
     for name, item in items.items():
+        if name in skip:
+            continue
         default = inspect.signature(function).parameters[name].default
         if default is inspect.Parameter.empty:
             parser.add_argument(name, type=item, nargs="+", help=texts.get(name, "").capitalize())

@@ -16,8 +16,8 @@ SPELLED = {"from_": "from"}
 def add_reading_arguments(parser: Any, kind: type[Options]) -> None:
     """Add an option to a parser (jsonargparse's) for each of `kind` and, as `--columns.NAME`, of `Columns`."""
     texts = {
-        **_described(Options),
         **_described(kind),
+        **_described(Options),
         **{f"columns.{name}": text for name, text in _described(Columns).items()},
     }
     for field in fields(Columns):

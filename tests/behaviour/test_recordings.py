@@ -26,8 +26,8 @@ def test_what_was_watched_is_without_the_gaps():
     assert read(TABLE).watched.to_numpy().tolist() == [
         ["s1", "m1", 0.0, 5.0],
         ["s1", "m1", 8.0, 12.0],
-        ["s1", "m2", 1.0, 26.0],
         ["s2", "m1", 2.0, 3.0],
+        ["s1", "m2", 1.0, 26.0],
     ]
 
 
@@ -38,11 +38,11 @@ def test_plans_are_fragments_with_recording_group_condition_and_times():
         [1, 2],
         [2, 2],
         [0],
-        [1],
         [0],
+        [1],
     ]
-    assert plans.recording == ("s1", "s1", "s1", "s1", "s2")
-    assert [plans.group_names[g] for g in plans.group.tolist()] == ["m1", "m1", "m2", "m2", "m1"]
+    assert plans.recording == ("s1", "s1", "s2", "s1", "s1")
+    assert [plans.group_names[g] for g in plans.group.tolist()] == ["m1", "m1", "m1", "m2", "m2"]
     assert [plans.condition_names[c] for c in plans.condition.tolist()] == [
         "drug",
         "drug",
@@ -50,7 +50,7 @@ def test_plans_are_fragments_with_recording_group_condition_and_times():
         "saline",
         "saline",
     ]
-    assert plans.began[:, 0].tolist() == [0, 8, 1, 20, 2]
+    assert plans.began[:, 0].tolist() == [0, 8, 2, 1, 20]
     assert plans.durations[1].tolist() == [1.5, 2.5]
     assert len(read(TABLE).plans()) == 4
 
@@ -86,7 +86,7 @@ def test_starts_alone_leave_stops_unknown_unless_the_next_ends_them():
     table = TABLE.drop(columns="stop")
     assert read(table).events["stop"].isna().all()
     stops = read(table, ends="next").events["stop"].to_numpy()
-    np.testing.assert_array_equal(stops, [4, np.nan, 9.5, np.nan, 20, np.nan, np.nan])
+    np.testing.assert_array_equal(stops, [4, np.nan, 9.5, np.nan, np.nan, 20, np.nan])
 
 
 @pytest.mark.parametrize(

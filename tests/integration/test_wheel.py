@@ -119,7 +119,7 @@ def test_bad_input_is_one_line(installed: Path, tmp_path: Path) -> None:
         (["fit", "--config", "gruu", "x.csv"], "gru"),
         (["report", "nowhere.csv"], "nowhere.csv"),
         (["example", "."], "ends in .csv"),
-        (["paint"], "there are fit, report, score, sample"),
+        (["paint"], "there are check, fit, report, score, sample"),
     ],
 )
 def test_each_command_names_what_is_wrong(words: list[str], says: str, capsys: pytest.CaptureFixture) -> None:

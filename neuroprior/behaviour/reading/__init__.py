@@ -3,6 +3,6 @@
 from neuroprior.behaviour.reading.columns import Columns
 from neuroprior.behaviour.reading.options import Options
 from neuroprior.behaviour.reading.problems import ReadingError
-from neuroprior.behaviour.reading.read import read, read_recordings
+from neuroprior.behaviour.reading.read import read
 
-__all__ = ["Columns", "Options", "ReadingError", "read", "read_recordings"]
+__all__ = ["Columns", "Options", "ReadingError", "read"]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from neuroprior.behaviour.reading.frames import are_frames, number_rows, read_labelled_frames
 from neuroprior.behaviour.reading.sequences import strings_of_sequences
 from neuroprior.behaviour.reading.table import MIN_REPEATS, Floats, Part, Table
-from neuroprior.behaviour.reading.times import CLOCKS, Times, over_midnight, smallest_unit
+from neuroprior.behaviour.reading.times import CLOCKS, HALF_A_DAY, Times, over_midnight, smallest_unit
 
 
 def rows_of_events(table: Table) -> Part:
@@ -25,6 +25,8 @@ def rows_of_events(table: Table) -> Part:
         table.problems.add(f"`stop` must be {start_times.kind}, as `start` is, got {stop_times.kind}", [0], table.place)
     if start_times and start_times.kind == CLOCKS:
         start, stop = _past_midnight(table, start, stop)
+    elif len(table.roles.at.get("stop", [])) > 1:  # the day of the start stands before the time of the stop
+        stop = np.where(stop < start - HALF_A_DAY, stop + 86400, stop)
     start, stop = _with_durations(table, start, stop, duration_times)
     wrong = np.flatnonzero(stop < start - 1e-9)
     if wrong.size:
@@ -117,7 +119,13 @@ def _exclusive(table: Table, start: Floats, stop: Floats) -> tuple[Floats, Float
     same = np.diff(unit[order])[: len(order) - 1] == 0
     gaps = (start[order][1:] - stop[order][:-1])[same]
     gaps = gaps[np.isfinite(gaps)]
-    alike = len(gaps) >= 3 and gaps[0] > 0 and np.all(np.abs(gaps - gaps[0]) < 1e-6 * max(gaps[0], 1))
+    once = float((np.abs(gaps - 1) < 1e-9).mean()) if len(gaps) else 0.0
+    if once >= 0.5 and not (np.abs(gaps) < 1e-9).any() and table.options.ends == "auto":
+        table.notes.append(
+            f"{once:.0%} of the stops are 1 before the next start, and none is at it: if they are the last frame of a"
+            " bout, say --ends inclusive"
+        )
+    alike = len(gaps) >= 2 and gaps[0] > 0 and np.all(np.abs(gaps - gaps[0]) < 1e-6 * max(gaps[0], 1))
     if ends != "inclusive" and not (alike and "duration" not in table.roles.at):
         return start, stop
     texts = np.concatenate(

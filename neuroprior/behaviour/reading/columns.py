@@ -149,6 +149,17 @@ def find_roles(sheet: Sheet, columns: Columns, words: Mapping[str, str]) -> Role
     if "start" in roles.found and program is None:
         _add_dates(sheet, roles)
     _add_factors_above(sheet, roles, closed)
+    plains = {plain(name): name for name in reversed(sheet.frame.columns)}
+    group = plains.get("group")
+    if (
+        group
+        and "subject" not in roles.at
+        and not {"subject", "factors"} & closed
+        and {"plan", "action"} <= set(plains)
+    ):
+        # In tables of plans a group is what is independent.
+        roles.at["subject"], roles.found = [group], {*roles.found, "subject"}
+        roles.at["factors"] = [name for name in roles.at.get("factors", []) if name != group]
     _choose_behaviour(sheet, roles, "behaviour" in ranges, closed)
     _choose_layout(sheet, roles, words)
     if roles.layout == "rows of sequences":
@@ -259,6 +270,12 @@ def _without_header(sheet: Sheet, roles: Roles) -> Roles:
             roles.at = {"start": [names[0]], "stop": [names[1]], "behaviour": [names[2]]}
             roles.notes.append(f"{sheet.name} is read as labels of Audacity: start, stop, label")
             return roles
+    clocks = [name for name in names if frame[name].str.fullmatch(r"-?(\d+:)?\d+:\d+([.,]\d+)?").all()]
+    if clocks:
+        raise ReadingError(
+            f"{sheet.name}: the file must have a header, got data in its first line; name columns by number, such as"
+            f" --columns.start {clocks[0]!r} --columns.behaviour {names[-1]!r}"
+        )
     roles.at["behaviour"] = names
     roles.found.add("behaviour")
     roles.layout = "rows of sequences" if len(names) > 1 else "events"
@@ -385,7 +402,8 @@ def _choose_behaviour(sheet: Sheet, roles: Roles, is_range: bool, closed: set[st
     if "behaviour" in closed and roles.program and roles.program.layout == "columns of behaviours":
         known = []
     wide = _numbered_run(frame, free) if roles.program is None else []
-    if wide and all(_is_indicator(frame[name]) for name in wide) and _are_channels(sheet, roles, wide):
+    zeros = bool(wide) and not _names_behaviours(wide) and all(_is_indicator(frame[name]) for name in wide)
+    if zeros and _are_channels(sheet, roles, wide):
         wide = []
     if wide and (not known or len(wide) > 5 or _names_behaviours(wide)):
         roles.at["behaviour"], roles.layout = wide, "rows of sequences"

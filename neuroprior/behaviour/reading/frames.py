@@ -8,11 +8,17 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from neuroprior.behaviour.reading.columns import INDICATORS
 from neuroprior.behaviour.reading.table import MIN_REPEATS, Floats, Part, Table
 from neuroprior.behaviour.reading.times import smallest_unit
 
 TOGETHER = "+"
 """Between behaviours that are done at once."""
+
+MIN_FRAME_REPEATS = 0.6
+"""Share of rows with the label of the row before, at least which rows at equal steps are frames, where no name says so:
+of two labels at random half do.
+"""
 
 MIN_REGULAR = 0.9
 """Share of steps between rows that are equal, at least, where rows are frames."""
@@ -36,7 +42,8 @@ def are_frames(table: Table, start: Floats, labels: NDArray[Any]) -> bool:
     if same.sum() < 5:
         return False
     repeats = float((labels[1:] == labels[:-1])[same].mean())
-    return _usual_step(table, np.diff(start)[same]) is not None and repeats > MIN_REPEATS
+    least = MIN_REPEATS if table.unit == "frames" else MIN_FRAME_REPEATS
+    return _usual_step(table, np.diff(start)[same]) is not None and repeats > least
 
 
 def _usual_step(table: Table, steps: Floats) -> float | None:
@@ -150,6 +157,8 @@ def _other_channels(table: Table) -> list[str]:
         cells = table.frame[name]
         words = pd.unique(cells[cells != ""])
         if name in used or not 1 <= len(words) <= MAX_CHANNEL_LABELS:
+            continue
+        if {str(word).lower() for word in words} <= INDICATORS:
             continue
         is_text = pd.to_numeric(pd.Series(words, dtype=object), errors="coerce").isna().all()
         values = cells.to_numpy(object)

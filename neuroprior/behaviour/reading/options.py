@@ -39,6 +39,10 @@ class Options:
 
     Raises:
         ValueError: an option is out of range.
+
+    Example:
+        >>> Options(rename={"walk": "move"}).label("walk")
+        'move'
     """
 
     columns: Columns | Mapping[str, Any] | None = None

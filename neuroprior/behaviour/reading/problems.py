@@ -14,6 +14,10 @@ class ReadingError(ValueError):
 
     Attributes:
         problems: a line each; the message has them one behind the other.
+
+    Example:
+        >>> ReadingError(["a.csv: the file must hold a table", "b.csv: the file must hold a table"]).problems[1]
+        'b.csv: the file must hold a table'
     """
 
     def __init__(self, problems: str | Sequence[str]) -> None:

@@ -14,7 +14,7 @@ from neuroprior.behaviour.reading.names import NAMES, plain
 from neuroprior.behaviour.reading.options import Options
 from neuroprior.behaviour.reading.problems import Problems, ReadingError
 from neuroprior.behaviour.reading.sheets import Sheet, find_files, read_sheets, sheet_of_frame
-from neuroprior.behaviour.reading.table import JOIN, MAX_OVERLAP, Part, Table
+from neuroprior.behaviour.reading.table import JOIN, MAX_OVERLAP, SECONDS, Part, Table
 from neuroprior.behaviour.recordings import Recordings, Source
 
 KEYS = ("recording", "subject", "observer")
@@ -222,10 +222,8 @@ def _combine(parts: list[Part], notes: list[str], options: Options) -> Recording
     filled = [part for part in parts if len(part.events)]
     if not filled:
         raise ReadingError([f"{part.sheet.name}: no row has a behaviour" for part in parts])
-    units = list(dict.fromkeys(part.unit for part in filled))
     first = [note for part in parts for note in part.first_notes]
-    if len(units) > 1:
-        first.append(f"the units of time differ between files ({', '.join(unit or 'unknown' for unit in units)})")
+    units = _one_unit(filled, first)
     _keep_files_apart(filled, first)
     events = pd.concat([part.events for part in filled], ignore_index=True)
     offsets = np.cumsum([0, *[int(part.fragment.max()) + 1 for part in filled]])
@@ -284,6 +282,28 @@ def _combine(parts: list[Part], notes: list[str], options: Options) -> Recording
     if options.from_ is not None or options.to is not None:
         recordings = recordings.window(options.from_, options.to)
     return recordings
+
+
+def _one_unit(parts: list[Part], notes: list[str]) -> list[str]:
+    """Bring the times of several files to one unit, that of the first; a note where some do not say theirs.
+
+    Raises:
+        ReadingError: units that cannot be compared.
+    """
+    units = list(dict.fromkeys(part.unit for part in parts))
+    known = [unit for unit in units if unit]
+    if len(known) > 1 and not set(known) <= set(SECONDS):
+        raise ReadingError(f"times must have one unit in all files, got {', '.join(known)} ({parts[-1].sheet.name})")
+    for part in parts:
+        if len(known) > 1 and part.unit and part.unit != known[0]:
+            factor = SECONDS[part.unit] / SECONDS[known[0]]
+            part.events[["start", "stop"]] *= factor
+            if part.spans is not None:
+                part.spans[["start", "stop"]] *= factor
+            notes.append(f"the times of {part.sheet.name} are read in {known[0]}, as those of the other files")
+    if len(units) > 1 and "" in units:
+        notes.append(f"some files do not say their unit of time, and are taken to be in {known[0]}")
+    return known or units
 
 
 def _keep_files_apart(parts: list[Part], notes: list[str]) -> None:

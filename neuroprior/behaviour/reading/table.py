@@ -14,13 +14,16 @@ from neuroprior.behaviour.reading.names import NO_SUBJECT, plain
 from neuroprior.behaviour.reading.options import Options
 from neuroprior.behaviour.reading.problems import Problems
 from neuroprior.behaviour.reading.sheets import Sheet
-from neuroprior.behaviour.reading.times import CLOCKS, DATES, Times, read_times
+from neuroprior.behaviour.reading.times import CLOCKS, DATES, NUMBERS, Times, read_times
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 JOIN = "|"
 """Between the labels of several columns."""
+
+SECONDS = {"s": 1.0, "ms": 0.001}
+"""Units of time that can be converted."""
 
 UNIT = re.compile(r"\(?(s|ms|sec|seconds|min|frames|h|)\)?", re.IGNORECASE)
 """A unit of time in a row below the header."""
@@ -205,12 +208,35 @@ class Table:
         found = read_times(
             texts, use, self.place, self.problems, separator=self.sheet.separator, day_first=self.options.day_first
         )
+        if use != "start" and found.kind == NUMBERS:
+            return self._in_unit_of_starts(use, names[0], found)
         if use == "start":
             if found.kind == CLOCKS or found.kind == DATES:
                 self.unit = "s"
             else:
                 self.unit = self.unit or _unit_of(names[0], self.sheet.above)
         return found
+
+    def _in_unit_of_starts(self, use: str, name: str, found: Times) -> Times | None:
+        """Return times in the unit of the starts, where the names of both columns say theirs.
+
+        Frames beside seconds cannot be compared: a column that was found is left out, one that was named is an error.
+        """
+        start, own = self.roles.at.get("start", [""])[-1], _unit_of(name, {})
+        other = _unit_of(start, {})
+        if not own or not other or own == other:
+            return found
+        if own in SECONDS and other in SECONDS:
+            self.notes.append(f"the column {name!r} is read in {other}, as {start!r} is")
+            return found._replace(values=found.values * (SECONDS[own] / SECONDS[other]))
+        if use in self.roles.found:
+            self.notes.append(
+                f"the column {name!r} is in {own} where {start!r} is in {other}, and is not used as {use}"
+            )
+            del self.roles.at[use]
+            return None
+        self.problems.add(f"`{use}` must be in {other}, as {start!r} is, got {name!r} in {own}", [0], self.place)
+        return None
 
     def unit_codes(self) -> Integers:
         """Return the number of the recording and subject (and observer) of each row."""
@@ -290,18 +316,15 @@ class Table:
             events["observer"] = self.observer[rows]
         for name in [*self.roles.at.get("factors", []), *self.roles.at.get("context", [])]:
             events[name] = self.frame[name].to_numpy(object)[rows]
-        keys = ["recording", "subject", "observer"] if "observer" in events else ["recording", "subject"]
         # Recordings stay in the order in which they appear.
-        appear = [pd.factorize(events[key])[0] for key in keys]
+        unit = self.unit_codes()[rows]
         untimed = np.isnan(start)
         clock = np.where(untimed, -np.inf, start) if not untimed.all() else np.zeros(len(start))
         if untimed.any() and not untimed.all():
-            clock = pd.Series(start).groupby(list(appear)).ffill().fillna(-np.inf).to_numpy()
-        order = np.lexsort((np.arange(len(events)), clock, *reversed(appear)))
+            clock = pd.Series(start).groupby(unit).ffill().fillna(-np.inf).to_numpy()
+        order = np.lexsort((np.arange(len(events)), clock, unit))
         events, rows = events.iloc[order].reset_index(drop=True), rows[order]
-        begin = np.zeros(len(events), bool)
-        for codes in appear:
-            begin |= np.diff(codes[order], prepend=-1) != 0
+        begin = np.diff(unit[order], prepend=-1) != 0
         if stretch is not None:
             begin |= np.diff(stretch[order], prepend=-1) != 0
         missing = events["behaviour"].eq("").to_numpy()

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Literal
 
 from neuroprior._checks import check_sizes
-from neuroprior.behaviour.reading import Options, read_recordings
+from neuroprior.behaviour.reading import Options
+from neuroprior.behaviour.reading.read import read_recordings
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.plans import Plans, constant_context, read_plans
 from neuroprior.plans.columns import check_names
@@ -35,6 +36,8 @@ class ReadOptions(Options):
     """How files of behaviour are read as plans: the options of `neuroprior.behaviour.read`, and these.
 
     Attributes:
+        columns, missing, missing_words, unpaired, overlaps, ends: see `neuroprior.behaviour.Options`.
+        day_first, words, merge_repeats, from_, to, drop, rename: see there.
         max_gap: a longer pause between two behaviours ends a plan, too; in the unit of the times.
         compare: the factor that is compared, such as the treatment, where recordings have several.
         num_actions: number of actions, where they are numbers and the file does not say.
@@ -42,7 +45,7 @@ class ReadOptions(Options):
         unknown: what behaviours do that are none of the names: an error, or a gap, at which a plan ends.
 
     Example:
-        >>> ReadOptions(columns={"behaviour": "Behavior", "recording": "session"}, max_gap=10).missing
+        >>> ReadOptions(columns={"behaviour": "Behavior"}, max_gap=10).missing
         'gap'
     """
 

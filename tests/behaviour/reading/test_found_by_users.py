@@ -1,0 +1,163 @@
+"""What new users' files showed: each was read as other events once."""
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from neuroprior.behaviour import read
+
+
+@pytest.fixture
+def study(tmp_path):
+    """A function that reads a text as the file `name`."""
+
+    def read_text(text: str, columns: Any = None, name: str = "f.csv", **options: Any):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+        return read(path, columns, **options)
+
+    return read_text
+
+
+def rows(recordings):
+    """Recording, behaviour, start and stop of each event."""
+    events = recordings.events[["recording", "behaviour", "start", "stop"]].astype(object)
+    return [tuple(None if value != value else value for value in row) for row in events.itertuples(index=False)]
+
+
+def test_labels_0_and_1_are_labels(study):
+    found = study("subject,behavior,start,stop\na,0,0,5\na,1,5,6\na,0,6,9\n")
+    assert rows(found) == [("f", "0", 0, 5), ("f", "1", 5, 6), ("f", "0", 6, 9)]
+
+
+def test_names_that_are_there_twice_make_no_data_of_a_header(study):
+    found = study("subject,behavior,start,stop,notes,notes\nm1,rest,0,2,a,b\nm1,eat,2,3,x,y\nm2,rest,3,5,,z\n")
+    assert rows(found) == [("f", "rest", 0, 2), ("f", "eat", 2, 3), ("f", "rest", 3, 5)]
+
+
+@pytest.mark.parametrize("columns", [None, {"behaviour": ["cluster_0", "cluster_1", "cluster_2"]}])
+def test_numbered_columns_of_zeros_and_ones_are_behaviours(columns, study):
+    on = [0, 0, 1, 1, 1, 2, 0]
+    lines = [f"{i}," + ",".join(str(int(k == one)) for k in range(3)) for i, one in enumerate(on)]
+    found = study("frame,cluster_0,cluster_1,cluster_2\n" + "\n".join(lines) + "\n", columns)
+    due = [("cluster_0", 0, 2), ("cluster_1", 2, 5), ("cluster_2", 5, 6), ("cluster_0", 6, 7)]
+    assert [row[1:] for row in rows(found)] == due
+    assert len(study("action_1,action_2,action_3\n0,1,0\n1,0,0\n").events) == 6  # a plan a row
+
+
+def test_days_do_not_lie_upon_one_another(study):
+    found = study(
+        "animal,date,behavior,start,end\na,2024-03-04,rest,14:00:00,14:00:10\n"
+        "a,2024-03-04,walk,23:59:50,00:00:20\na,2024-03-05,rest,09:00:05,09:00:11\n"
+    )
+    assert found.events["behaviour"].tolist() == ["rest", "walk", "rest"]
+    np.testing.assert_allclose(np.diff(found.events["start"]), [35990, 32415])
+    np.testing.assert_allclose(found.events["stop"] - found.events["start"], [10, 30, 6])
+
+
+def test_trials_of_a_session_are_recordings_of_their_own(study):
+    found = study("session,trial,subject,behavior,start,stop\n1,1,a,rest,0,5\n1,2,a,sleep,0,4\n1,2,a,walk,4,6\n")
+    assert [row[0] for row in rows(found)] == ["1|1", "1|2", "1|2"]
+    choices = study("rat,trial,choice,rt\na,1,left,.5\na,2,right,.4\na,3,left,.6\n", {"behaviour": "choice"})
+    assert [row[:2] for row in rows(choices)] == [("f", "left"), ("f", "right"), ("f", "left")]
+
+
+def test_files_of_one_name_in_two_folders_are_two_recordings(study, tmp_path):
+    for day in (1, 2):
+        study("behaviour,start,stop\nrest,0,5\nwalk,5,7\n", name=f"day{day}/a.csv")
+    found = read([tmp_path / "day1" / "a.csv", tmp_path / "day2" / "a.csv"])
+    assert [row[0] for row in rows(found)] == ["day1/a", "day1/a", "day2/a", "day2/a"]
+
+
+def test_units_are_not_mixed(study, tmp_path):
+    found = study("subject,behaviour,start (s),duration (ms)\na,groom,0,5000\na,rest,5,250\n")
+    assert [row[2:] for row in rows(found)] == [(0, 5), (5, 5.25)]
+    frames = study("subject,behaviour,start (s),stop frame\na,groom,0,100\na,rest,5,200\n")
+    assert [row[3] for row in rows(frames)] == [None, None]
+    study("subject,behaviour,start_ms,stop_ms\nb,groom,1000,1500\n", name="g.csv")
+    both = read([tmp_path / "g.csv", tmp_path / "f.csv"], {"stop": "none", "duration": "none"})
+    assert both.unit == "ms"
+    assert both.events["start"].tolist() == [1000, 0, 5000]
+
+
+def test_totals_are_no_events(study):
+    with pytest.raises(ValueError, match=r"table of totals \(column .Total duration"):
+        study("Subject,Behavior,Total duration (s),Duration mean (s)\na,rest,12.5,3.1\na,walk,7,1.75\n")
+
+
+def test_channels_of_frames_are_each_read(study):
+    mother, infant = ["", "groom", "groom", "groom", "rest", "rest"], ["sleep", "sleep", "sleep", "cry", "cry", "cry"]
+    lines = [f"{i / 2},{a},{b}" for i, (a, b) in enumerate(zip(mother, infant, strict=True))]
+    found = study("Time,Mother,Behaviour\n" + "\n".join(lines) + "\n")
+    assert [row[1:] for row in rows(found)] == [
+        ("sleep", 0, 1.5),
+        ("groom", 0.5, 2),
+        ("cry", 1.5, 3),
+        ("rest", 2, 3),
+    ]
+
+
+def test_one_column_of_zeros_and_ones_is_watched_from_the_first_frame(study):
+    found = study("frame,freezing\n" + "".join(f"{i},{int(3 <= i < 6)}\n" for i in range(10)))
+    assert rows(found) == [("f", "freezing", 3, 6)]
+    assert found.watched[["start", "stop"]].to_numpy().tolist() == [[0, 10]]
+
+
+@pytest.mark.parametrize(
+    ("cells", "due"),
+    [
+        (["A-B-C", "B"], [["A", "B", "C"], ["B"]]),
+        (["A/3-B/2-A/1", "B/2"], [["A", "B", "A"], ["B"]]),
+        (["rest > walk > eat", "eat > rest"], [["rest", "walk", "eat"], ["eat", "rest"]]),
+        (
+            ["self-groom rear self-groom", "rear self-groom"],
+            [["self-groom", "rear", "self-groom"], ["rear", "self-groom"]],
+        ),
+    ],
+)
+def test_strings_of_sequences(cells, due):
+    found = read(pd.DataFrame({"id": ["1", "2"], "sequence": cells}))
+    assert [list(one) for _, one in found.events.groupby("recording", sort=False)["behaviour"]] == due
+
+
+def test_times_in_other_languages(study):
+    found = study("Tier;Verhalten;Startzeit;Endzeit\na;ruhen;0,5;1.200,25\na;gehen;1.200,25;1.201\n")
+    assert [row[2:] for row in rows(found)] == [(0.5, 1200.25), (1200.25, 1201)]
+    french = study("Sujet;Comportement;Début;Fin\na;repos;0;2,5\n")
+    assert rows(french) == [("f", "repos", 0, 2.5)]
+
+
+def test_an_index_of_times_is_the_time():
+    labels = ["a"] * 4 + ["b"] * 5 + ["a"] * 3
+    frame = pd.DataFrame({"label": labels}, index=pd.timedelta_range("0s", freq="500ms", periods=12))
+    found = read(frame)
+    assert found.events[["start", "stop"]].to_numpy().tolist() == [[0, 2], [2, 4.5], [4.5, 6]]
+
+
+def test_frames_with_rounded_times_are_frames(study):
+    labels = ["rest"] * 40 + ["walk"] * 25 + ["rest"] * 35
+    found = study("time,label\n" + "".join(f"{i / 30:.3f},{one}\n" for i, one in enumerate(labels)))
+    np.testing.assert_allclose(found.events["stop"], [40 / 30, 65 / 30, 100 / 30], atol=0.001)
+
+
+def test_times_that_cannot_be_read_are_errors(study):
+    with pytest.raises(ValueError, match="`start` must be a time"):
+        study("animal,behaviour,start\na,x,00:00:01:12\na,y,00:00:02:13\n")
+    half_days = study("animal,behaviour,start\na,x,09:00:00 AM\na,y,01:00:00 PM\n")
+    assert half_days.events["start"].tolist() == [32400, 46800]
+
+
+def test_many_small_recordings_take_no_time_each():
+    number = 3000
+    frame = pd.DataFrame(
+        {
+            "id": np.repeat(np.arange(number), 20),
+            "behaviour": np.tile(list("abcde" * 4), number),
+            "start": np.tile(np.arange(20.0), number),
+            "stop": np.tile(np.arange(1.0, 21), number),
+        }
+    )
+    assert read(frame).num_recordings == number
