@@ -1,5 +1,6 @@
 """Checks of arguments, each of which names the argument that is wrong."""
 
+import operator
 import os
 import sys
 import warnings
@@ -89,16 +90,32 @@ def as_list(name: str, values: Any) -> list[Any]:
     return [one.item() if hasattr(one, "item") else one for one in found]
 
 
+def is_whole(value: object) -> TypeGuard[int]:
+    """True for an integer of any library, such as `env.action_space.n` of Gymnasium; bool is none.
+
+    Example:
+        >>> is_whole(np.int64(3)), is_whole(True), is_whole(3.0)
+        (True, False, False)
+    """
+    if isinstance(value, bool | np.bool_) or getattr(value, "dtype", None) == torch.bool:
+        return False
+    try:
+        operator.index(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
 def check_sizes(**sizes: object) -> None:
     """Raise ValueError, naming the argument, unless all are integers of at least 1."""
     for name, size in sizes.items():
-        if not isinstance(size, int) or isinstance(size, bool) or size < 1:
+        if not is_whole(size) or size < 1:
             raise ValueError(f"`{name}` must be an integer of at least 1, got {size!r}")
 
 
 def check_count(name: str, count: object, bytes_each: int = 8) -> None:
     """Raise ValueError, naming the argument, unless it is an integer of at least 0 that fits in memory."""
-    if not isinstance(count, int) or isinstance(count, bool) or count < 0:
+    if not is_whole(count) or count < 0:
         raise ValueError(f"`{name}` must be an integer of at least 0, got {count!r}")
     check_memory(bytes_each * count, **{name: count})
 
@@ -110,7 +127,7 @@ def is_number(value: object) -> TypeGuard[float]:
 
 def check_seed(seed: object) -> None:
     """Raise ValueError unless it is an integer that torch takes as a seed."""
-    if not isinstance(seed, int) or isinstance(seed, bool) or not -(2**63) <= seed < 2**63:
+    if not is_whole(seed) or not -(2**63) <= seed < 2**63:
         raise ValueError(f"`seed` must be an integer from -2**63 to 2**63 - 1, got {seed!r}")
 
 

@@ -232,7 +232,8 @@ class PriorPlanner(Planner):
         check_temperature(temperature)
         if not isinstance(prior, Steppable):
             raise ValueError(f"`prior` must be a prior with num_actions, start and step, got {type(prior).__name__}")
-        self.prior, self.length, self.num_plans, self.temperature = prior, length, num_plans, temperature
+        self.prior, self.temperature = prior, temperature
+        self.length, self.num_plans = int(length), int(num_plans)
 
     def _threads_for(self, num_plans: int) -> AbstractContextManager[None]:
         """As `Stepper.threads_for`, but all threads where a value of the user's may be worth them."""

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neuroprior._checks import check_single_precision, warn_caller
+from neuroprior._checks import check_single_precision, is_whole, warn_caller
 
 Integers = NDArray[np.integer[Any]]
 Floats = NDArray[np.floating[Any]]
@@ -260,7 +260,7 @@ def check_distinct(what: str, names: Sequence[str] | None) -> None:
 
 def check_names(num_actions: int | None, action_names: Sequence[str] | None) -> Names | None:
     """The names as a tuple; ValueError for names, or a number of actions, that are impossible."""
-    if num_actions is not None and (type(num_actions) is not int or num_actions < 1):
+    if num_actions is not None and (not is_whole(num_actions) or num_actions < 1):
         raise ValueError(f"`num_actions` must be an integer of at least 1, got {num_actions!r}")
     if action_names is None:
         return None

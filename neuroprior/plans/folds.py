@@ -6,7 +6,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_same_names, check_seed, check_sizes
+from neuroprior._checks import check_same_names, check_seed, check_sizes, is_whole
 from neuroprior.plans.plans import AnyPlans, Plans
 from neuroprior.plans.sequences import Sequences
 
@@ -133,7 +133,7 @@ def folds(plans: Sequences, number: int, seed: int = 0) -> list[tuple[Tensor, Te
     unit = plans.group.unique(return_inverse=True)[1].cpu() if grouped and plans.group is not None else None
     unit = torch.arange(len(plans)) if unit is None else unit
     count = int(unit.max()) + 1 if len(unit) else 0
-    if not isinstance(number, int) or isinstance(number, bool) or not 2 <= number <= count:
+    if not is_whole(number) or not 2 <= number <= count:
         kind = "groups" if grouped else "plans"
         raise ValueError(f"`folds` must be between 2 and the number of {kind}, {count}, got {number!r}")
     check_seed(seed)

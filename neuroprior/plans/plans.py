@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from neuroprior._checks import check_count, check_memory, check_range, check_sizes, is_integer
+from neuroprior._checks import check_count, check_memory, check_range, check_sizes, is_integer, is_whole
 from neuroprior.plans.columns import check_distinct
 from neuroprior.plans.sequences import Sequences, expand_context
 
@@ -70,6 +70,7 @@ class Plans(Sequences):
 
     def __post_init__(self) -> None:
         check_sizes(num_actions=self.num_actions)
+        object.__setattr__(self, "num_actions", int(self.num_actions))
         if self.num_actions > MOST_ACTIONS:
             raise ValueError(f"num_actions: at most {MOST_ACTIONS}, not {self.num_actions}; number the actions from 0")
         actions = as_numbers("actions", self.actions)
@@ -112,7 +113,7 @@ class Plans(Sequences):
 
     def _check_end(self, actions: Tensor) -> None:
         """Check that `end` only closes plans; where lengths are not given, take them from it."""
-        if not isinstance(self.end, int) or isinstance(self.end, bool) or not 0 <= self.end < self.num_actions:
+        if not is_whole(self.end) or not 0 <= self.end < self.num_actions:
             raise ValueError(f"`end` must be one of the {self.num_actions} actions, got {self.end!r}")
         position = torch.arange(1, actions.shape[1] + 1, device=actions.device)
         first = torch.where(actions == self.end, position, actions.shape[1]).amin(1) if actions.shape[1] else None

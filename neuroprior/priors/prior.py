@@ -67,7 +67,7 @@ class Prior(SavedModule):
             raise ValueError("num_contexts and context_size: a prior takes an index or features, not both")
         if num_patterns is not None and (num_contexts is not None or context_size is not None):
             raise ValueError("num_patterns: a prior takes patterns, an index or features, one of them")
-        self.num_actions, self.num_contexts, self.context_size = num_actions, num_contexts, context_size
+        self.num_actions, self.num_contexts, self.context_size = int(num_actions), num_contexts, context_size
         self.num_patterns = num_patterns
         self.context_per: Literal["plan", "step"] | None = "step" if self.takes_context else None
         self.end: int | None = None

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import operator
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -63,7 +64,8 @@ def save(prior: SavedModule, folder: str | os.PathLike[str]) -> Path:
         "learned": prior.learned,
         "sha256": hashlib.sha256(data).hexdigest(),
     }
-    contents = {"model.safetensors": data, "config.json": (json.dumps(config, indent=2) + "\n").encode()}
+    text = json.dumps(config, indent=2, default=operator.index) + "\n"
+    contents = {"model.safetensors": data, "config.json": text.encode()}
     for name, content in contents.items():
         (folder / f".{name}.partial").write_bytes(content)
     for name in contents:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from math import ceil, inf
 
-from neuroprior._checks import is_number
+from neuroprior._checks import is_number, is_whole
 from neuroprior.plans.sequences import Sequences, check_validation
 
 MIN_CHECK, MAX_CHECK = 10, 100
@@ -68,8 +68,9 @@ class Settings:
             value = getattr(self, name)
             if value is None and name != "window":
                 continue
-            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+            if not is_whole(value) or value < 1:
                 raise ValueError(f"`{name}` must be a whole number of at least 1, got {value}.")
+            object.__setattr__(self, name, int(value))
         for name in ("learning_rate", "gradient_clip"):
             value = getattr(self, name)
             if not is_number(value) or not 0 < value < inf:

@@ -6,7 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_count, check_memory, check_seed, check_sizes, is_number
+from neuroprior._checks import check_count, check_memory, check_seed, check_sizes, is_number, is_whole
 from neuroprior._random import generator_on
 from neuroprior.worlds.observations import Features
 from neuroprior.worlds.tabular import TabularWorld
@@ -238,7 +238,7 @@ def goal_direction(world: GridWorld) -> Callable[[Tensor], Tensor]:
 
 def _check_view(view: int | None) -> None:
     """Raise ValueError unless `view` is a radius of at least 1, or None."""
-    if view is not None and (isinstance(view, bool) or not isinstance(view, int) or view < 1):
+    if view is not None and (not is_whole(view) or view < 1):
         raise ValueError(f"`view` must be a radius of at least 1 square, got {view!r}")
 
 

@@ -2,10 +2,22 @@
 
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 
-from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior, UniformPrior, sample
+from neuroprior import (
+    GRUPrior,
+    MarkovPrior,
+    Plans,
+    SamplingPlanner,
+    TransformerPrior,
+    UniformPrior,
+    load,
+    sample,
+    save,
+)
+from neuroprior.priors import StackedPrior
 from neuroprior.priors.learning import training_plans
 from neuroprior.sampling import sample_in_world
 from tests.support.sources import distribution, every_plan, random_world, refuses, seeded
@@ -304,3 +316,26 @@ def test_many_actions():
 
 def test_every_plan_is_numbered_as_written():
     assert every_plan(2, 2).tolist() == [[0, 0], [0, 1], [1, 0], [1, 1]]
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+@pytest.mark.parametrize("kind", [GRUPrior, TransformerPrior, StackedPrior])
+def test_networks_sample_and_score_in_other_precisions(kind, dtype):
+    plans = torch.randint(4, (20, 6), generator=torch.Generator().manual_seed(0))
+    prior = kind(4).fit(plans, max_steps=3, progress=False)
+    single, step = prior.log_prob(plans), prior.step(plans[:, 0], prior.start(20)[1])[0]
+    prior = prior.to(dtype)
+    assert prior.sample(5, 4, generator=torch.Generator().manual_seed(1)).shape == (5, 4)
+    torch.testing.assert_close(prior.log_prob(plans).float(), single.float(), rtol=0.02, atol=0.05)
+    torch.testing.assert_close(prior.step(plans[:, 0], prior.start(20)[1])[0].float(), step, rtol=0.02, atol=0.05)
+
+
+def test_integers_of_other_libraries_are_integers(tmp_path):
+    prior = MarkovPrior(np.int32(4), np.int64(1)).fit(torch.randint(4, (20, 6)))
+    assert load(save(prior, tmp_path)).config == MarkovPrior(4, 1).config
+    assert prior.sample(np.int64(3), np.int64(5)).shape == (3, 5)
+    assert SamplingPlanner(UniformPrior(np.int64(4)), np.int64(3), np.int64(5)).length == 3
+    assert Plans(torch.zeros(2, 3, dtype=torch.long), np.int64(3)).num_actions == 3
+    for wrong in (True, np.bool_(True), 3.0, "3", torch.tensor(True)):
+        with pytest.raises(ValueError, match="num_actions"):
+            UniformPrior(wrong)

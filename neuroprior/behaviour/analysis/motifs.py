@@ -11,7 +11,7 @@ from scipy import stats
 from scipy.special import stdtrit, xlogy
 from torch import Tensor
 
-from neuroprior._checks import as_list, check_sizes
+from neuroprior._checks import as_list, check_sizes, is_whole
 from neuroprior._statistics import holm
 from neuroprior.behaviour.analysis.comparison import units
 from neuroprior.behaviour.analysis.flat import FlatPlans, ranks
@@ -103,7 +103,7 @@ def motifs(
     """
     lengths = as_list("lengths", lengths)
     for n in lengths:
-        if not isinstance(n, int) or isinstance(n, bool) or n < 2:
+        if not is_whole(n) or n < 2:
             raise ValueError(f"`lengths` must be at least 2, got {n!r}.")
     if not lengths or len(set(lengths)) < len(lengths):
         raise ValueError(f"`lengths` must be different integers, one or more, got {list(lengths)}.")

@@ -303,6 +303,8 @@ class Mixer(NeuralPrior):
         rest = inputs[..., 1:]
         if self.index is not None:
             vectors, rest = vectors + self.index(rest[..., 0].long()), rest[..., 1:]
+        rest = rest.to(self.features.weight.dtype)
+        hidden = None if hidden is None else hidden.to(rest.dtype)
         forecasts = rest[..., : self.num_experts * self.num_actions]
         vectors = vectors + self.features(rest / 2)
         layers = None if hidden is None else hidden.unflatten(1, (self.num_layers, -1)).transpose(0, 1)

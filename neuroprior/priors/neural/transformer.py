@@ -330,7 +330,7 @@ class Block(nn.Module):
 
     def _add(self, x: Tensor, mixed: Tensor) -> Tensor:
         """`x` plus the output of attention, `mixed`, and then plus that of the two-layer network."""
-        x = x + self.drop(self.out(mixed))
+        x = x + self.drop(self.out(mixed.to(x.dtype)))  # keys and values are kept in single precision
         added: Tensor = self.drop(self.mlp(x))
         return x + added
 
@@ -343,7 +343,7 @@ class Block(nn.Module):
         every = total <= span + 1
         plain = num == total and every
         mask = filled if plain or (num == 1 and every) else reached(num, total, span, query.device)
-        query, key, value = map(self._heads, (query, key, value))
+        query, key, value = (self._heads(one).to(value.dtype) for one in (query, key, value))
         if num == 1 and query.is_cuda and len(query) >= MANY_QUERIES:
             scores = query @ key.mT / query.shape[-1] ** 0.5
             scores = scores if mask is None else scores.masked_fill(~mask, -torch.inf)
