@@ -232,7 +232,7 @@ def gru_step(gru: nn.GRU, below: Tensor, layers: Tensor, rows: Tensor | None = N
         The output `[N, width]`, and the new `layers`.
     """
     after = []
-    layers = layers.to(gru.weight_hh_l0.dtype)  # states are in single precision beside numbers of actions
+    layers = layers.to(gru.all_weights[0][1].dtype)  # states are in single precision beside numbers of actions
     if layers.device.type != "cpu" or layers.dtype != torch.float32:
         below = below if rows is None else below.index_select(0, rows)
         for before, weights in zip(layers, gru.all_weights, strict=True):
