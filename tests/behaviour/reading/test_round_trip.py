@@ -2,6 +2,7 @@
 
 import gzip
 import io
+import os
 import tempfile
 import zipfile
 from pathlib import Path
@@ -14,6 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior.behaviour.reading import ReadingError, read
+
+EXAMPLES = int(os.environ.get("NEUROPRIOR_EXAMPLES", "25"))
+"""Studies of each test; `NEUROPRIOR_EXAMPLES=1000` searches longer."""
 
 NAMES = st.lists(
     st.sampled_from(["rest", "walk", "groom", "Rear", "eat é", "sniff (nose)", "dig-hole"]),
@@ -121,7 +125,7 @@ def read_back(frame: pd.DataFrame, file: tuple[str, str, bool, str], **options: 
         return read(path, **options).events
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=EXAMPLES, deadline=None)
 @given(
     study=studies(), file=FILES, words=st.sampled_from(VOCABULARIES), ends=st.sampled_from(["stop", "duration", "both"])
 )
@@ -133,7 +137,7 @@ def test_rows_of_events(
     same_events(read_back(table, file, ends="exclusive"), study)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=EXAMPLES, deadline=None)
 @given(study=studies(), file=FILES, pair=st.sampled_from(EVENT_WORDS), order=st.sampled_from(["time", "behaviour"]))
 def test_rows_of_starts_and_stops(
     study: pd.DataFrame, file: tuple[str, str, bool, str], pair: tuple[str, str], order: str
@@ -146,7 +150,7 @@ def test_rows_of_starts_and_stops(
     same_events(read_back(table, file), study)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=EXAMPLES, deadline=None)
 @given(study=studies(), file=FILES, words=st.sampled_from(VOCABULARIES))
 def test_rows_of_frames_and_columns_of_behaviours(
     study: pd.DataFrame, file: tuple[str, str, bool, str], words: dict[str, str]
@@ -168,7 +172,7 @@ def test_rows_of_frames_and_columns_of_behaviours(
     same_events(read_back(indicators, file), runs)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=EXAMPLES, deadline=None)
 @given(study=studies(), file=FILES, header=st.sampled_from(["action_{}", "t{}", "{}", "Jan.{:02d}"]))
 def test_rows_of_sequences(study: pd.DataFrame, file: tuple[str, str, bool, str], header: str) -> None:
     rows = [[subject, *one["behaviour"]] for subject, one in study.groupby("subject", sort=False)]
@@ -184,7 +188,7 @@ def test_rows_of_sequences(study: pd.DataFrame, file: tuple[str, str, bool, str]
     same_events(found, expected, times=False)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=EXAMPLES, deadline=None)
 @given(study=studies(), file=FILES)
 def test_strings_of_sequences(study: pd.DataFrame, file: tuple[str, str, bool, str]) -> None:
     study = study.assign(behaviour=study["behaviour"].str.replace("[^A-Za-z]", "", regex=True))
@@ -197,7 +201,7 @@ def test_strings_of_sequences(study: pd.DataFrame, file: tuple[str, str, bool, s
     np.testing.assert_allclose(found["stop"] - found["start"], whole["length"])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=EXAMPLES, deadline=None)
 @given(study=studies(), file=FILES, seed=st.integers(0, 99), extra=st.booleans())
 def test_the_order_of_rows_other_columns_and_units_change_nothing(
     study: pd.DataFrame, file: tuple[str, str, bool, str], seed: int, extra: bool
@@ -214,7 +218,7 @@ def test_the_order_of_rows_other_columns_and_units_change_nothing(
     same_events(read_back(clock, file, ends="exclusive"), study)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=EXAMPLES, deadline=None)
 @given(study=studies(), cut=st.integers(1, 200), file=FILES)
 def test_a_file_that_is_cut_off_gives_no_other_events_silently(
     study: pd.DataFrame, cut: int, file: tuple[str, str, bool, str]
