@@ -155,6 +155,7 @@ def plans_of_events(
     fragment: NDArray[np.int64],
     *,
     factor: str | None,
+    reference: str | None,
     context: Sequence[str],
     notes: list[str],
     max_gap: float | None,
@@ -167,6 +168,7 @@ def plans_of_events(
     Args:
         events, fragment: of `Recordings`, of one observer.
         factor: the column that is compared.
+        reference: its level that comes first; None: the first by name.
         context: columns of what is known before each action.
         notes: what was said of the recordings; what is noticed here is added.
         max_gap, num_actions, action_names, unknown: see there.
@@ -222,9 +224,14 @@ def plans_of_events(
     alone = len(subjects) == len(first) and bool((events["subject"] == events["recording"]).all())
     begun = events["start"].to_numpy(np.float64)
     seconds = (events["stop"] - events["start"]).to_numpy(np.float32)
+    if reference is not None and factor is None:
+        raise ValueError(f"`reference` must be a level of a factor, got {reference!r}; name the factor (--compare)")
     fields: dict[str, Any] = _context_fields(context, events, wide, notes)
     if factor is not None:
-        codes, levels = pd.factorize(first[factor], sort=True)
+        names_of = sorted(pd.unique(first[factor]), key=lambda level: (level != reference, str(level)))
+        if reference is not None and reference not in names_of:
+            raise ValueError(f"`reference` must be one of {', '.join(names_of)}, got {reference!r}")
+        codes, levels = pd.Index(names_of).get_indexer(pd.Index(first[factor])), names_of
         if (codes < 0).any() or "" in set(levels):
             raise ValueError(f"`condition` must be known for each recording, got an empty {factor!r} in some")
         fields |= {"condition": torch.from_numpy(codes.astype(np.int64)), "condition_names": tuple(map(str, levels))}

@@ -1,6 +1,6 @@
 """Recordings: events in real time, and the plans that priors learn from."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -181,6 +181,17 @@ class Recordings:
             odd.append(", ".join(marks))
         return table.assign(note=odd).reset_index()
 
+    def by_level(self, factor: str | None) -> Iterator[tuple[str, "Recordings"]]:
+        """Return the recordings of each level of a factor, with its name; without a factor all, named ""."""
+        if factor is None:
+            yield "", self
+            return
+        for level in sorted(pd.unique(self.events[factor])):
+            inside = (self.events[factor] == level).to_numpy()
+            pairs = self.events[inside][KEYS].drop_duplicates()
+            part = self._with(self.events[inside], self.fragment[inside])
+            yield str(level), replace(part, spans=self.watched.merge(pairs, on=KEYS))
+
     def time_budget(self) -> pd.DataFrame:
         """Return the share of the watched time that each behaviour takes: rows are subjects, columns behaviours."""
         watched = self.watched
@@ -247,6 +258,7 @@ class Recordings:
         *,
         max_gap: float | None = None,
         condition: str | None = None,
+        reference: str | None = None,
         num_actions: int | None = None,
         action_names: Sequence[str] | None = None,
         unknown: str = "error",
@@ -256,6 +268,7 @@ class Recordings:
         Args:
             max_gap: a longer pause ends a plan, too; in the unit of the recordings.
             condition: the factor that is compared; None: the only one, if there is one.
+            reference: its level that others are compared with, such as "saline"; None: the first by name.
             num_actions: A, where behaviours are numbers; None: the largest + 1.
             action_names: A names in the order of their numbers; None: the behaviours that occur, sorted.
             unknown: what behaviours do that are none of `action_names`: "error", or "gap": a plan ends there.
@@ -273,6 +286,7 @@ class Recordings:
             kept.events,
             kept.fragment,
             factor=condition or (self.factors[0] if len(self.factors) == 1 else None),
+            reference=reference,
             context=kept.context,
             notes=list(kept.notes),
             max_gap=max_gap,

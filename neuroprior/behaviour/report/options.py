@@ -10,6 +10,7 @@ from neuroprior._checks import check_sizes
 from neuroprior.behaviour.reading import Options
 from neuroprior.behaviour.reading.read import read_recordings
 from neuroprior.behaviour.recorded_plans import RecordedPlans
+from neuroprior.behaviour.recordings import Recordings
 from neuroprior.plans import Plans, constant_context, read_plans
 from neuroprior.plans.columns import check_names
 from neuroprior.plans.io import MINARI
@@ -40,6 +41,7 @@ class ReadOptions(Options):
         day_first, words, merge_repeats, from_, to, drop, rename: see there.
         max_gap: a longer pause between two behaviours ends a plan, too; in the unit of the times.
         compare: the factor that is compared, such as the treatment, where recordings have several.
+        reference: its level that the others are compared with, such as vehicle.
         num_actions: number of actions, where they are numbers and the file does not say.
         action_names: names of the actions in the order of their numbers, where the file does not say.
         unknown: what behaviours do that are none of the names: an error, or a gap, at which a plan ends.
@@ -51,6 +53,7 @@ class ReadOptions(Options):
 
     max_gap: float | None = None
     compare: str | None = None
+    reference: str | None = None
     num_actions: int | None = None
     action_names: Sequence[str] | None = None
     unknown: Literal["error", "gap"] = "error"
@@ -66,15 +69,7 @@ class ReadOptions(Options):
         """
         file = files if isinstance(files, str | Path) else files[0] if len(files) == 1 else None
         if file is None or is_recording(file):
-            recordings = read_recordings(files, self)
-            plans = recordings.plans(
-                max_gap=self.max_gap,
-                condition=self.compare,
-                num_actions=self.num_actions,
-                action_names=self.action_names,
-                unknown=self.unknown,
-            )
-            return replace(plans, notes=(*plans.notes, *_feature_notes(plans)))
+            return self.plans(read_recordings(files, self))
         of_plans = ("num_actions", "action_names")
         if given := [name for name, value in DEFAULTS.items() if name not in of_plans and getattr(self, name) != value]:
             raise ValueError(f"`{given[0]}` must be left out for {file}, whose kind holds plans and no recordings")
@@ -83,6 +78,18 @@ class ReadOptions(Options):
             plans = _read_recorded(str(file), self.num_actions, self.action_names)
         notes = [str(one.message).removeprefix(f"{file}: ") for one in warned]
         return replace(plans, notes=(*plans.notes, *notes, *_feature_notes(plans)))
+
+    def plans(self, recordings: Recordings) -> RecordedPlans:
+        """Returns the plans of recordings, as `Recordings.plans` with these options."""
+        plans = recordings.plans(
+            max_gap=self.max_gap,
+            condition=self.compare,
+            reference=self.reference,
+            num_actions=self.num_actions,
+            action_names=self.action_names,
+            unknown=self.unknown,
+        )
+        return replace(plans, notes=(*plans.notes, *_feature_notes(plans)))
 
 
 DEFAULTS = vars(ReadOptions())

@@ -12,6 +12,7 @@ from neuroprior._checks import check_count
 from neuroprior._jobs import Progress
 from neuroprior._threads import one_thread
 from neuroprior.behaviour.durations.past_durations import PastDurations
+from neuroprior.behaviour.reading.read import read_recordings
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.recordings import Recordings
 from neuroprior.behaviour.report.document import Document, check_place, write_document
@@ -83,13 +84,18 @@ def report(
     file = "" if isinstance(plans, Plans | Recordings) else name_files(plans)
     if out is not None:
         check_place(Path(out), ["plans"] if "scores" in sections else [])  # before hours of work
+    files = plans
+    if not _in_memory(plans) and is_recording(plans):
+        plans = read_recordings(plans, reading)
     if priors is None:
+        _check_other_files(files, test)
         found = _cross_validate(plans, test, skip, fits, reading, out, "lags" in sections)
     else:
         if given := fits.changed() + ["test"] * (test is not None):
             names = ", ".join(f"`{name}`" for name in given)
             raise ValueError(f"{names} must be left out where `priors` are given, which are not fitted.")
         found = _score_saved(plans, priors, skip, reading)
+    found = replace(found, recordings=plans if isinstance(plans, Recordings) else None)
     document = _document(found, sections, file, command)
     if out is not None:
         write_document(document, Path(out))
@@ -130,9 +136,6 @@ def _cross_validate(
     whole, empty = _with_actions(plans, reading)
     other, cut = None, False
     if test is not None:
-        files = [Path(one).resolve() for one in (plans, test) if isinstance(one, str | Path)]
-        if len(files) == 2 and files[0] == files[1]:
-            raise ValueError(f"`test` must be other plans than those that are learned from, got {test}.")
         other, empty = _with_actions(test, reading)
         other = _numbered_alike(whole, other, "test" if isinstance(test, Plans) else str(test))
     whole, other = _contexts_from_0(whole, other)
@@ -226,6 +229,17 @@ def _finding(found: Evaluation) -> str:
     return f"{found.best.label} takes {fewest}{bits:.3f} {interval}; {found.too_few}."
 
 
+def _check_other_files(files: Plans | Recordings | Files, test: Plans | Recordings | Files | None) -> None:
+    """Raise ValueError where the plans to score are those to learn from."""
+    paths = [
+        Path(one).resolve()
+        for some in (files, test)
+        for one in ([some] if isinstance(some, str | Path) else some if isinstance(some, list | tuple) else [])
+    ]
+    if len(set(paths)) < len(paths):
+        raise ValueError(f"`test` must be other plans than those that are learned from, got {test}.")
+
+
 def _in_memory(plans: Plans | Recordings | Files) -> bool:
     return isinstance(plans, Plans | Recordings)
 
@@ -233,7 +247,7 @@ def _in_memory(plans: Plans | Recordings | Files) -> bool:
 def _read(plans: Plans | Recordings | Files, reading: ReadOptions) -> RecordedPlans:
     """The plans, without an end symbol."""
     if isinstance(plans, Recordings):
-        plans = plans.plans(condition=reading.compare, max_gap=reading.max_gap)
+        plans = reading.plans(plans)
     plans = RecordedPlans.of(plans) if isinstance(plans, Plans) else reading.read(plans)
     return plans if plans.end is None else plans.without_end()
 

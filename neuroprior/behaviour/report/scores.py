@@ -18,6 +18,7 @@ from neuroprior._jobs import JobRun
 from neuroprior.behaviour.analysis.comparison import Score, action_bits, score_bits, too_few, unit_name
 from neuroprior.behaviour.durations.past_durations import PastDurations
 from neuroprior.behaviour.recorded_plans import RecordedPlans
+from neuroprior.behaviour.recordings import Recordings
 from neuroprior.behaviour.report import fits
 from neuroprior.behaviour.report.fits import (
     ACTIONS,
@@ -78,6 +79,7 @@ class Evaluation:
     first_fold: RecordedPlans  # the plans that are held out in the first fold
     gains: pd.DataFrame  # the information by lag that models give
     settings: dict[str, Any]  # how it was made
+    recordings: Recordings | None = None  # that the plans are fragments of
 
     @property
     def unit(self) -> str:

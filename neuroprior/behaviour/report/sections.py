@@ -23,6 +23,7 @@ from neuroprior.behaviour.report.fits import ACTIONS
 from neuroprior.behaviour.report.modes import mode_section
 from neuroprior.behaviour.report.page import FigureBox, Section
 from neuroprior.behaviour.report.part import LISTED, SIGNIFICANT, Part, action_names, group_names, p_text
+from neuroprior.behaviour.report.recordings import recording_section
 from neuroprior.behaviour.report.scores import Evaluation
 from neuroprior.plans import Plans, constant_context, has_patterns
 
@@ -345,6 +346,7 @@ def _action_drift(plans: Plans) -> pd.DataFrame:
 
 SECTIONS: dict[str, Callable[[Evaluation], Part | None]] = {
     "file": file_section,
+    "recordings": recording_section,
     "scores": score_section,
     "conditions": condition_section,
     "lags": lag_section,
