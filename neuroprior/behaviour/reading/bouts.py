@@ -120,7 +120,7 @@ def _exclusive(table: Table, start: Floats, stop: Floats) -> tuple[Floats, Float
     gaps = (start[order][1:] - stop[order][:-1])[same]
     gaps = gaps[np.isfinite(gaps)]
     once = float((np.abs(gaps - 1) < 1e-9).mean()) if len(gaps) else 0.0
-    if once >= 0.5 and not (np.abs(gaps) < 1e-9).any() and table.options.ends == "auto":
+    if 0.5 <= once < 1 and not (np.abs(gaps) < 1e-9).any() and table.options.ends == "auto":
         table.notes.append(
             f"{once:.0%} of the stops are 1 before the next start, and none is at it: if they are the last frame of a"
             " bout, say --ends inclusive"

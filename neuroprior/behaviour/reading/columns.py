@@ -11,7 +11,7 @@ import pandas as pd
 from neuroprior.behaviour.reading.names import DEEPETHOGRAM, NAMES, PROGRAMS, SIMBA, SUMMARY, WORDS, Program, plain
 from neuroprior.behaviour.reading.problems import ReadingError
 from neuroprior.behaviour.reading.sheets import Sheet
-from neuroprior.behaviour.reading.times import count_times
+from neuroprior.behaviour.reading.times import MISSING_TIMES, count_times
 
 NOT_USED = "none"
 """In place of a column's name: the column that would be found is left out."""
@@ -263,10 +263,12 @@ def _without_header(sheet: Sheet, roles: Roles) -> Roles:
     frame = sheet.frame
     numeric = [bool(pd.to_numeric(frame[name].str.replace(",", "."), errors="coerce").notna().all()) for name in frame]
     names = list(frame.columns)
-    if len(names) in (2, 3) and numeric[:2] == [True, True] and not (len(names) == 3 and numeric[2]):
+    if len(names) in (2, 3) and numeric[:2] == [True, True]:
         start, stop = (pd.to_numeric(frame[name].str.replace(",", ".")) for name in names[:2])
-        fraction = (start % 1 != 0).any() or bool((stop > start).all())
-        if (len(names) == 3 or fraction) and bool((stop >= start).all()) and len(names) == 3:
+        decimals = all(frame[name].str.contains("[.,]").all() for name in names[:2])
+        if len(names) == 2 and decimals:
+            raise ReadingError(f"{sheet.name}: labels of Audacity must have a name each, got starts and stops alone")
+        if len(names) == 3 and (decimals or not numeric[2]) and bool((stop >= start).all()):
             roles.at = {"start": [names[0]], "stop": [names[1]], "behaviour": [names[2]]}
             roles.notes.append(f"{sheet.name} is read as labels of Audacity: start, stop, label")
             return roles
@@ -399,6 +401,7 @@ def _choose_behaviour(sheet: Sheet, roles: Roles, is_range: bool, closed: set[st
     known = [plains[name] for name in NAMES["behaviour"] if name in plains]
     known = [name for name in known if not len(frame) or frame[name].ne("").any()]
     known = [name for name in known if not _is_measured(frame[name])]
+    known = [name for name in known if plain(name) != "name" or "stop" in roles.at]
     if "behaviour" in closed and roles.program and roles.program.layout == "columns of behaviours":
         known = []
     wide = _numbered_run(frame, free) if roles.program is None else []
@@ -407,6 +410,9 @@ def _choose_behaviour(sheet: Sheet, roles: Roles, is_range: bool, closed: set[st
         wide = []
     if wide and (not known or len(wide) > 5 or _names_behaviours(wide)):
         roles.at["behaviour"], roles.layout = wide, "rows of sequences"
+    elif roles.program and roles.program.columns.get("behaviour"):
+        wanted = ", ".join(roles.program.columns["behaviour"])
+        raise ReadingError(f"{sheet.name}: {roles.program.name}, must have a column of labels ({wanted}), got none")
     elif known:
         text = [name for name in known if plain(name) != "name"] or known
         roles.at["behaviour"] = text[:1]
@@ -434,7 +440,12 @@ def _choose_behaviour(sheet: Sheet, roles: Roles, is_range: bool, closed: set[st
 
 def _is_indicator(column: "pd.Series[Any]") -> bool:
     values = {str(text).lower() for text in pd.unique(column)}
-    return values <= INDICATORS and bool(values - {""})
+    other = values - INDICATORS - frozenset(MISSING_TIMES)
+    if not other:
+        return bool({"0", "1", "true", "false", "0.0", "1.0"} & values)
+    # A slip of the pen in a column of zeros and ones is an error of its own, and makes no other column of it.
+    wrong = column.str.lower().isin(other).sum()
+    return {"0", "1"} <= values and wrong <= max(1, 0.01 * len(column)) and len(other) <= 2
 
 
 def _is_measured(column: "pd.Series[Any]") -> bool:
@@ -543,8 +554,12 @@ def check_is_no_summary(sheet: Sheet, roles: Roles) -> None:
     Raises:
         ReadingError: no time is known, and a column that is not used is called a total, a mean or a number.
     """
-    if roles.layout != "events" or {"start", "stop", "duration"} & roles.at.keys():
+    if roles.layout != "events" or {"start", "stop"} & roles.at.keys():
         return
+    words = [name for name in sheet.frame if name not in roles.used() and len(sheet.frame)]
+    sums = [name for name in words if sheet.frame[name].str.lower().str.contains(SUMMARY).mean() > 0.5]
+    if sums:
+        raise ReadingError(f"{sheet.name}: a row must be an event, got totals (column {sums[0]!r}); export the events")
     totals = [name for name in sheet.frame if name not in roles.used() and SUMMARY.search(plain(name))]
     numbers = [name for name in totals if pd.to_numeric(sheet.frame[name], errors="coerce").notna().any()]
     if numbers:
@@ -581,7 +596,7 @@ def _note_unused(sheet: Sheet, roles: Roles, words: Mapping[str, str]) -> None:
                 f"the column {name!r} seems to say which rows are starts and which stops, and is not used"
                 f" (--columns.event_type {name!r}): each row is read as an event"
             )
-    unused = [name for name in sheet.frame.columns if name not in used]
-    if unused and "(column" not in unused[0]:
+    unused = [name for name in sheet.frame.columns if name not in used and not name.startswith("(column ")]
+    if unused:
         shown = ", ".join(unused[:8]) + (f" and {len(unused) - 8} more" if len(unused) > 8 else "")
         roles.notes.append(f"columns that are not used: {shown}")

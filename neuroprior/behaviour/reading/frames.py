@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from neuroprior.behaviour.reading.columns import INDICATORS
 from neuroprior.behaviour.reading.table import MIN_REPEATS, Floats, Part, Table
-from neuroprior.behaviour.reading.times import smallest_unit
+from neuroprior.behaviour.reading.times import MISSING_TIMES, smallest_unit
 
 TOGETHER = "+"
 """Between behaviours that are done at once."""
@@ -38,12 +38,16 @@ def are_frames(table: Table, start: Floats, labels: NDArray[Any]) -> bool:
     if table.roles.program and table.roles.program.layout == "rows of frames":
         return True
     unit = table.unit_codes()
-    same = np.diff(unit) == 0
+    order = np.lexsort((start, unit))
+    same, labels = np.diff(unit[order]) == 0, labels[order]
     if same.sum() < 5:
         return False
     repeats = float((labels[1:] == labels[:-1])[same].mean())
-    least = MIN_REPEATS if table.unit == "frames" else MIN_FRAME_REPEATS
-    return _usual_step(table, np.diff(start)[same]) is not None and repeats > least
+    # Events have labels: blank ones at equal steps are frames in which nothing is done.
+    sure = table.unit == "frames" or float((labels == "").mean()) > 0.05
+    return _usual_step(table, np.diff(start[order])[same]) is not None and repeats > (
+        MIN_REPEATS if sure else MIN_FRAME_REPEATS
+    )
 
 
 def _usual_step(table: Table, steps: Floats) -> float | None:
@@ -55,7 +59,11 @@ def _usual_step(table: Table, steps: Floats) -> float | None:
         smallest_unit(table.frame[table.roles.at["start"][-1]].to_numpy(object)) if table.roles.at.get("start") else 0
     )
     near = np.abs(steps - step) <= max(0.02 * step, min(1.01 * rounding, 0.5 * step))
-    if step <= 0 or near.mean() <= MIN_REGULAR:
+    if step <= 0:
+        return None
+    whole = np.round(steps / step)  # frames may be missing where they are numbered
+    regular = near | ((whole > 1) & (np.abs(steps - whole * step) < 1e-9)) if table.unit == "frames" else near
+    if regular.mean() <= MIN_REGULAR:
         return None
     return float(np.mean(steps[near]))
 
@@ -127,7 +135,10 @@ def read_labelled_frames(table: Table, start: Floats, labels: NDArray[Any]) -> P
     """
     names = table.roles.at["behaviour"]
     blank = table.joined(names) == ""
-    lost = (labels == "") & ~blank & (table.options.missing == "gap")
+    lost = (labels == "") & (table.options.missing == "gap" if table.options.missing else ~blank)
+    if lost.any():
+        row = table.place(int(lost.argmax()))
+        table.notes.append(f"{int(lost.sum()):,} frames have no label (first in {row}): nothing is known of them")
     others = _other_channels(table) if "behaviour" in table.roles.found else {}
     channels = [labels]
     if others:
@@ -142,7 +153,7 @@ def read_labelled_frames(table: Table, start: Floats, labels: NDArray[Any]) -> P
         table.roles.at["behaviour"] = list(called)
         table.first_notes.append(f"the columns {', '.join(called)} hold labels at each frame: each is read for itself")
         lost = np.zeros(table.size, bool)
-    elif blank.any():
+    elif (blank & ~lost).any() and table.options.missing != "label":
         table.notes.append("frames with an empty cell were watched, and nothing was scored in them")
     return read_channels(table, start, channels, lost)
 
@@ -172,8 +183,14 @@ def columns_of_behaviours(table: Table) -> Part:
     """Read one row a frame with a column of zeros and ones for each behaviour; -1 is not scored."""
     names = table.roles.at["behaviour"]
     values = [table.frame[name].str.lower().to_numpy(object) for name in names]
+    for name, value in zip(names, values, strict=True):
+        wrong = np.flatnonzero(~np.isin(value, [*INDICATORS, *MISSING_TIMES]))
+        if wrong.size:
+            what = f"{name!r} must be 0 or 1, got {str(value[wrong[0]])!r}"
+            table.problems.add(what, wrong.tolist(), table.place)
     on = np.stack([np.isin(value, ["1", "1.0", "true"]) for value in values], 1)
-    unscored = np.logical_and.reduce([np.isin(value, ["-1", "-1.0", ""]) for value in values])
+    unscored = np.logical_or.reduce([np.isin(value, [*MISSING_TIMES[1:], "-1", "-1.0"]) for value in values])
+    unscored |= np.logical_and.reduce([value == "" for value in values])
     times = table.times("start")
     index = table.frame.columns[0]
     if times is None and index.startswith("(column ") and index not in names:
@@ -188,7 +205,7 @@ def columns_of_behaviours(table: Table) -> Part:
     if never:
         table.notes.append(f"behaviours that never occur: {', '.join(never)}")
     if unscored.any():
-        table.notes.append(f"{int(unscored.sum()):,} rows are empty or -1 in all columns: they were not scored")
+        table.notes.append(f"{int(unscored.sum()):,} rows are empty, -1 or missing: they were not scored")
     table.split_sessions(start, on.argmax(1).astype(str).astype(object))
     if table.options.overlaps != "join":
         if several:

@@ -12,6 +12,7 @@ UNIT_AT_END = re.compile(r"\s(s|sec|secs|seconds|sf|ms|hh mm ss ms|hh mm ss|ss m
 NAMES: dict[str, tuple[str, ...]] = {
     "behaviour": (
         "behavior", "behaviour", "behaviors", "behaviours", "action", "actions", "activity", "syllable", "concept name",
+        "syllables reindexed",
         "event", "event name", "label", "labels", "state", "states", "annotation", "behavior code", "behaviour code",
         "behavior name", "element", "species", "call type", "classifier", "motif", "cluster", "prediction", "code",
         "b soid labels", "sequence", "seq", "verhalten", "comportement", "comportamiento", "act", "status", "name",
@@ -112,11 +113,15 @@ PROGRAMS: tuple[Program, ...] = (
              start="time", event_type="status", duration="", **_BORIS),
     _program("Noldus Observer, event log", "observation|behavior|event type", "rows of starts and stops",
              recording="observation", subject="subject", behaviour="behavior", event_type="event type",
-             start="time relative|time relative hmsf|time relative hms", duration="duration"),
+             start="time relative|time relative hmsf|time relative hms|time absolute hms", duration="duration"),
     _program("keypoint-MoSeq, moseq_df", "name|syllable|frame index", "rows of frames", "frames",
              recording="name", subject="name", behaviour="syllable", start="frame index", factors="group"),
     _program("keypoint-MoSeq, results", "syllable|centroid x|centroid y", "rows of frames", "frames",
-             behaviour="syllable", start="", factors=""),
+             recording="name|recording|session|session name", behaviour="syllable",
+             start="frame index|frame|time", factors="group"),
+    _program("MoSeq2, moseq_df", "labels (usage sort)|frame index", "rows of frames", "frames",
+             recording="sessionname|session name|uuid", subject="subjectname|subject name", factors="group",
+             behaviour="labels (usage sort)", start="frame index"),
     _program("SimBA, bouts", "video|event|start time|end time", recording="video", behaviour="event",
              start="start time", stop="end time", duration="bout time", event_type=""),
     _program("EthoVision, raw data", "trial time|recording time", "columns of behaviours",
@@ -150,8 +155,11 @@ MISSING_WORDS = (
 )  # fmt: skip
 """What stands for no label, in lower case."""
 
-SUMMARY = re.compile(r"\b(total|mean|median|average|std|sd|number|frequency|occurr?ences)\b")
+SUMMARY = re.compile(r"\b(?:total|mean|median|average|std|sd|number|frequency|occurr?ences)\b")
 """In the names of columns of tables that sum events up."""
+
+TOTALS = ("total", "totals", "sum", "gesamt", "summe")
+"""What stands for a behaviour in a row that sums up those above it, in lower case."""
 
 SEQUENCE_MISSING = ("*", "%")
 """States of TraMineR's sequences that stand for none."""

@@ -23,7 +23,8 @@ class Options:
     Attributes:
         columns: which columns hold what; those that are not named are found by their names.
         missing: what rows without a label say: nobody knows ("gap": a fragment ends), that nothing was done
-            ("nothing"), that they are a behaviour ("label"), or that the file is wrong ("error").
+            ("nothing"), that they are a behaviour ("label"), or that the file is wrong ("error"). None: a gap, but for
+            empty cells of frames, in which nothing was done.
         missing_words: labels that stand for none, beside the empty cell.
         unpaired: what starts without a stop do, and stops without a start: "error", "drop" both, or keep "open" starts.
         overlaps: bouts of one behaviour of one subject that overlap are an "error", or kept ("keep"); "join" reads
@@ -46,7 +47,7 @@ class Options:
     """
 
     columns: Columns | Mapping[str, Any] | None = None
-    missing: Missing = "gap"
+    missing: Missing | None = None
     missing_words: Sequence[str] = MISSING_WORDS
     unpaired: Unpaired = "error"
     overlaps: Overlaps = "error"
@@ -62,7 +63,7 @@ class Options:
     def __post_init__(self) -> None:
         object.__setattr__(self, "columns", make_columns(self.columns))
         for name, kinds in (("missing", Missing), ("unpaired", Unpaired), ("overlaps", Overlaps), ("ends", Ends)):
-            if getattr(self, name) not in get_args(kinds):
+            if getattr(self, name) not in get_args(kinds) and not (name == "missing" and self.missing is None):
                 raise ValueError(f"`{name}` must be one of {', '.join(get_args(kinds))}, got {getattr(self, name)!r}")
         for name in ("missing_words", "drop"):
             if isinstance(getattr(self, name), str):

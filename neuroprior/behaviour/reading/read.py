@@ -84,11 +84,12 @@ def read_recordings(paths: Any, options: Options) -> Recordings:
 
 def _tell_stems_apart(groups: list[list[Sheet]]) -> None:
     """Put the folder before the names of files that are the same in several folders."""
-    count = Counter(sheet.stem for sheets in groups for sheet in sheets[:1])
+    count = Counter(stem for sheets in groups for stem in {sheet.stem for sheet in sheets})
     for sheets in groups:
         for sheet in sheets:
             if count[sheet.stem] > 1 and sheet.is_file:
-                sheet.stem = f"{Path(sheet.name.split(', ')[0]).parent.name}/{sheet.stem}"
+                file = Path(sheet.name.split(", ")[0])
+                sheet.stem = f"{file.stem if len(sheets) > 1 else file.parent.name}/{sheet.stem}"
 
 
 def _words_of_columns(columns: Columns) -> list[str]:
@@ -222,6 +223,8 @@ def _combine(parts: list[Part], notes: list[str], options: Options) -> Recording
     filled = [part for part in parts if len(part.events)]
     if not filled:
         raise ReadingError([f"{part.sheet.name}: no row has a behaviour" for part in parts])
+    if unknown := sorted(set(options.rename).difference(*(part.renamed for part in parts))):
+        raise ReadingError(f"`rename` must hold behaviours that occur, got {unknown[0]!r}")
     first = [note for part in parts for note in part.first_notes]
     units = _one_unit(filled, first)
     _keep_files_apart(filled, first)
@@ -319,6 +322,10 @@ def _keep_files_apart(parts: list[Part], notes: list[str]) -> None:
         again = part.events["recording"].isin(twice) & (part.events["subject"] == "")
         called = part.sheet.stem + " " + part.events["recording"].astype(str)
         part.events["recording"] = part.events["recording"].where(~again, called)
+        if part.spans is not None:
+            again = part.spans["recording"].isin(twice) & (part.spans["subject"] == "")
+            called = part.sheet.stem + " " + part.spans["recording"].astype(str)
+            part.spans["recording"] = part.spans["recording"].where(~again, called)
     notes.append(
         f"{len(twice):,} names of recordings occur in several files, which are kept apart by the names of the files"
     )

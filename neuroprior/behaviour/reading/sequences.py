@@ -114,5 +114,5 @@ def strings_of_sequences(table: Table) -> Part | None:
     ends = pd.Series(lengths).groupby(row_of).cumsum().to_numpy().astype(np.float64)
     what = "states with durations" if not separator else f"behaviours parted by {separator!r}"
     table.notes.append(f"each cell of {names[0]!r} is read as a sequence, {what}")
-    named = table.labels(np.array(labels, dtype=object))
+    named = table.labels(np.array(["" if word in SEQUENCE_MISSING else word for word in labels], dtype=object))
     return table.part(row_of, named, (ends - np.array(lengths)).astype(np.float64), ends)

@@ -1,8 +1,7 @@
 """A sheet whose columns are known, and the events that are read from it: what all layouts share."""
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from neuroprior.behaviour.reading.columns import Roles
-from neuroprior.behaviour.reading.names import NO_SUBJECT, plain
+from neuroprior.behaviour.reading.names import NO_SUBJECT, TOTALS, plain
 from neuroprior.behaviour.reading.options import Options
 from neuroprior.behaviour.reading.problems import Problems
 from neuroprior.behaviour.reading.sheets import Sheet
@@ -49,6 +48,7 @@ class Part:
         notes, first_notes: a line each; the first ones are weighty.
         empty: recordings without events.
         spans: when each recording was watched, where rows say so; see `Recordings.spans`.
+        renamed: labels that the user renames and that occur.
     """
 
     sheet: Sheet
@@ -61,6 +61,7 @@ class Part:
     first_notes: list[str] = field(default_factory=list)
     empty: list[str] = field(default_factory=list)
     spans: pd.DataFrame | None = None
+    renamed: set[str] = field(default_factory=set)
 
 
 class Table:
@@ -78,6 +79,7 @@ class Table:
         self.notes: list[str] = [*sheet.notes, *roles.notes]
         self.first_notes: list[str] = []
         self.empty: list[str] = []
+        self.renamed: set[str] = set()
         self.unit = roles.program.unit if roles.program else ""
         self._drop_rows()
         self.frame = sheet.frame
@@ -119,6 +121,13 @@ class Table:
                 self.notes.append(
                     f"{loose.sum():,} rows without behaviour, time and owner are left out ({sheet.place(row)})"
                 )
+        if len(label) == 1 and len(sheet.frame) > 1:
+            total = sheet.frame[label[0]].str.lower().isin(TOTALS).to_numpy()
+            below = np.logical_and.accumulate(total[::-1])[::-1]  # from the first of those at the end on
+            if below.any() and not total[~below].any():
+                keep &= ~below
+                row = int(below.argmax())
+                self.notes.append(f"{below.sum():,} rows of totals at the end are left out ({sheet.place(row)})")
         view = next((name for name in sheet.frame if plain(name) == "view"), None)
         if self.roles.program and self.roles.program.name.startswith("Raven") and view:
             twice = sheet.frame.drop(columns=view).duplicated().to_numpy()
@@ -181,6 +190,7 @@ class Table:
         """Return labels as the user wants them: "" where one is missing, renamed, and without those to drop."""
         codes, values = pd.factorize(texts)
         labels = [self.options.label(str(value)) for value in values]
+        self.renamed |= {str(value) for value in values} & self.options.rename.keys()
         numbers = [label for label in labels if label]
         if "-1" in numbers and all(number.isdecimal() for number in numbers if number != "-1"):
             rows = np.flatnonzero(np.array(labels, dtype=object)[codes] == "-1")
@@ -204,7 +214,8 @@ class Table:
             return None
         texts = self.frame[names[0]].to_numpy(object)
         for name in names[1:]:
-            texts = texts + " " + self.frame[name].to_numpy(object)
+            days = pd.Series(texts, dtype=object).str.replace(r"[ T]00:00(:00)?$", "", regex=True).to_numpy(object)
+            texts = days + " " + self.frame[name].to_numpy(object)
         found = read_times(
             texts, use, self.place, self.problems, separator=self.sheet.separator, day_first=self.options.day_first
         )
@@ -214,7 +225,7 @@ class Table:
             if found.kind == CLOCKS or found.kind == DATES:
                 self.unit = "s"
             else:
-                self.unit = self.unit or _unit_of(names[0], self.sheet.above)
+                self.unit = _unit_of(names[0]) or self.unit
         return found
 
     def _in_unit_of_starts(self, use: str, name: str, found: Times) -> Times | None:
@@ -222,8 +233,8 @@ class Table:
 
         Frames beside seconds cannot be compared: a column that was found is left out, one that was named is an error.
         """
-        start, own = self.roles.at.get("start", [""])[-1], _unit_of(name, {})
-        other = _unit_of(start, {})
+        start, own = self.roles.at.get("start", [""])[-1], _unit_of(name)
+        other = _unit_of(start)
         if not own or not other or own == other:
             return found
         if own in SECONDS and other in SECONDS:
@@ -332,7 +343,8 @@ class Table:
         fragment = np.cumsum(begin | missing) - 1
         events, fragment, rows = events[~missing].reset_index(drop=True), fragment[~missing], rows[~missing]
         fragment = np.unique(fragment, return_inverse=True)[1].astype(np.int64)
-        return Part(self.sheet, self.roles, events, fragment, rows, self.unit, self.notes, self.first_notes, self.empty)
+        part = Part(self.sheet, self.roles, events, fragment, rows, self.unit, self.notes, self.first_notes)
+        return replace(part, empty=self.empty, renamed=self.renamed)
 
 
 def _whole_numbers(keys: NDArray[Any]) -> NDArray[Any]:
@@ -343,7 +355,7 @@ def _whole_numbers(keys: NDArray[Any]) -> NDArray[Any]:
     return keys
 
 
-def _unit_of(name: str, above: Mapping[str, str]) -> str:
+def _unit_of(name: str) -> str:
     low = name.lower()
     if "frame" in low or "image" in low:
         return "frames"

@@ -47,8 +47,8 @@ class ReadOptions(Options):
         unknown: what behaviours do that are none of the names: an error, or a gap, at which a plan ends.
 
     Example:
-        >>> ReadOptions(columns={"behaviour": "Behavior"}, max_gap=10).missing
-        'gap'
+        >>> ReadOptions(columns={"behaviour": "Behavior"}, max_gap=10).max_gap
+        10
     """
 
     max_gap: float | None = None

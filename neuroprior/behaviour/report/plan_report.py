@@ -85,7 +85,7 @@ def report(
     if out is not None:
         check_place(Path(out), ["plans"] if "scores" in sections else [])  # before hours of work
     files = plans
-    if not _in_memory(plans) and is_recording(plans):
+    if not isinstance(plans, Plans | Recordings) and is_recording(plans):
         plans = read_recordings(plans, reading)
     if priors is None:
         _check_other_files(files, test)
