@@ -30,6 +30,9 @@ from neuroprior.priors.scoring import learned_from
 MOST_ACTIONS = 10_000
 """Kinds of actions beyond which they are thought to be names that look like numbers."""
 
+KEYS = {"plans": "rows"}
+"""The keys of tables in `results.json`, where they are others than the names of the CSV files."""
+
 FOLDS = 5
 """Folds where their number is not given; fewer where there are fewer groups."""
 
@@ -78,12 +81,12 @@ def report(
     """
     check_choices("sections", sections, tuple(SECTIONS))
     check_count("skip", skip, 0)
-    if reading is not None and _in_memory(plans) and (test is None or _in_memory(test)):
+    if reading is not None and isinstance(plans, Plans) and (test is None or isinstance(test, Plans)):
         raise ValueError("`reading` must be left out for plans in memory.")
     reading = reading or ReadOptions()
     file = "" if isinstance(plans, Plans | Recordings) else name_files(plans)
     if out is not None:
-        check_place(Path(out), ["plans"] if "scores" in sections else [])  # before hours of work
+        check_place(Path(out), ["plans"] if "scores" in sections else [], KEYS)  # before hours of work
     files = plans
     if not isinstance(plans, Plans | Recordings) and is_recording(plans):
         plans = read_recordings(plans, reading)
@@ -207,7 +210,7 @@ def _document(found: Evaluation, sections: Sequence[str], file: str, command: st
             "unit": found.unit,
             "file": {"name": file, **describe(found.plans)},
         },
-        keys={"plans": "rows"},
+        keys=KEYS,
     )
 
 
@@ -238,10 +241,6 @@ def _check_other_files(files: Plans | Recordings | Files, test: Plans | Recordin
     ]
     if len(set(paths)) < len(paths):
         raise ValueError(f"`test` must be other plans than those that are learned from, got {test}.")
-
-
-def _in_memory(plans: Plans | Recordings | Files) -> bool:
-    return isinstance(plans, Plans | Recordings)
 
 
 def _read(plans: Plans | Recordings | Files, reading: ReadOptions) -> RecordedPlans:

@@ -4,10 +4,12 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import pandas as pd
 import pytest
 import torch
 
 from neuroprior import Plans
+from neuroprior.behaviour import read
 from neuroprior.behaviour.report import plan_report
 from neuroprior.behaviour.report.document import Document
 from neuroprior.behaviour.report.options import FitOptions, ReadOptions
@@ -162,3 +164,32 @@ def test_options_of_files_reach_the_reader(tmp_path):
     assert merged["actions"] < plain["actions"] == gap["actions"] == 95
     labelled = facts(4, missing="label")
     assert (labelled["actions"], labelled["kinds of actions"]) == (96, 4)
+
+
+def test_a_report_replaces_an_earlier_one_of_its_folder(tmp_path):
+    plans, fits = chain(), FitOptions(models=["counts"], folds=2, processes=1)
+    first = report(plans, out=tmp_path, fits=fits, sections=["scores"])
+    again = report(plans, out=tmp_path, fits=fits, sections=["scores"])
+    assert again.tables["plans"].equals(first.tables["plans"])
+
+
+def test_recordings_have_a_time_budget_and_a_reference(tmp_path):
+    rows = [
+        (f"m{a}", "drug" if a % 2 else "saline", "abc"[(t + a) % 3], 2 * t, 2 * t + (2 if (t + a) % 3 else 1))
+        for a in range(6)
+        for t in range(12)
+    ]
+    frame = pd.DataFrame(rows, columns=["animal", "treatment", "behaviour", "start", "stop"])
+    fits = FitOptions(models=["counts"], folds=2, processes=1)
+    found = report(
+        read(frame), fits=fits, sections=["recordings", "conditions"], reading=ReadOptions(reference="saline")
+    )
+    budget = found.tables["time_budget"].set_index(["level", "behaviour"])
+    watched = [23 if (11 + a) % 3 == 0 else 24 for a in range(6)]
+    due = sum(4 / watched[a] for a in (1, 3, 5)) / 3  # "a" takes 1 of every 2, four times
+    assert budget.loc[("drug", "a"), "share"] == pytest.approx(due)
+    assert budget.loc[("drug", "a"), "subjects"] == 3
+    assert [name for name in found.tables["conditions"].columns if name.startswith("mean")] == [
+        "mean, saline",
+        "mean, drug",
+    ]
