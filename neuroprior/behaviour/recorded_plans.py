@@ -103,29 +103,30 @@ def durations_of(plans: Plans) -> Tensor:
 
 
 def join_fragments(plans: Plans, *values: Tensor) -> tuple[Any, ...]:
-    """Return plans with the fragments of each recording joined to one, and values `[N, L]` of their actions alike.
+    """Return plans whose fragments are joined to one plan a recording, and values of their actions joined alike.
 
-    What changes within a recording is measured over all of it, and not within the stretches between its gaps.
+    What changes within a recording is then measured over all of it, not within the stretches between its gaps.
 
     Args:
-        plans: N plans; those without names of recordings are left as they are.
-        values: `[N, L]` each, as the actions.
+        plans: N plans; those without names of recordings stay as they are.
+        values: `[N, L]` each, one for each action.
+
+    Returns:
+        The plans, and as many values `[recordings, longest]`, zero after the end of a plan.
 
     Example:
         >>> plans = RecordedPlans(torch.tensor([[0, 1], [1, 0]]), 2, recording=("a", "a"))
         >>> join_fragments(plans)[0].actions.tolist()
         [[0, 1, 1, 0]]
     """
-    recording = plans.recording if isinstance(plans, RecordedPlans) else None
-    if recording is None:
+    if not isinstance(plans, RecordedPlans) or plans.recording is None:
         return plans, *values
     group = [0] * len(plans) if plans.group is None else plans.group.tolist()
-    row_of, firsts = pd.factorize(pd.MultiIndex.from_arrays([list(recording), group]))
-    if len(firsts) == len(plans):
+    codes, recordings = pd.factorize(pd.MultiIndex.from_arrays([list(plans.recording), group]))
+    if len(recordings) == len(plans):
         return plans, *values
-    assert isinstance(plans, RecordedPlans)
-    row = torch.from_numpy(row_of.astype(np.int64))
-    mask, first = plans.mask().cpu(), torch.from_numpy(np.unique(row_of, return_index=True)[1])
+    row, first = torch.from_numpy(codes.astype(np.int64)), torch.from_numpy(np.unique(codes, return_index=True)[1])
+    mask = plans.mask().cpu()
     order = row.argsort(stable=True)
     size = mask.sum(1)[order]
     before = size.cumsum(0) - size
@@ -134,20 +135,18 @@ def join_fragments(plans: Plans, *values: Tensor) -> tuple[Any, ...]:
     new[1:] = row[order][1:] != row[order][:-1]
     offset[order] = before - before[new][new.cumsum(0) - 1]
     plan, step = mask.nonzero().unbind(1)
-    lengths = torch.zeros(len(firsts), dtype=torch.long).index_add_(0, row, mask.sum(1))
+    lengths = torch.zeros(len(recordings), dtype=torch.long).index_add_(0, row, mask.sum(1))
     at = row[plan], offset[plan] + step
 
-    def wide(one: Tensor) -> Tensor:
-        shape = (len(firsts), int(lengths.max()), *one.shape[2:])
-        joined = torch.zeros(shape, dtype=one.dtype)
-        joined[at] = one.cpu()[mask]
-        return joined.to(one.device)
+    def join(value: Tensor) -> Tensor:
+        joined = torch.zeros((len(recordings), int(lengths.max()), *value.shape[2:]), dtype=value.dtype)
+        joined[at] = value.cpu()[mask]
+        return joined.to(value.device)
 
     per_action: dict[str, Any] = {
-        name: wide(one) for name in plans.PER_ACTION if (one := getattr(plans, name)) is not None
+        name: join(value) for name in plans.PER_ACTION if (value := getattr(plans, name)) is not None
     }
-    joined = replace(plans[first], lengths=lengths, **per_action)
-    return joined, *map(wide, values)
+    return replace(plans[first], lengths=lengths, **per_action), *map(join, values)
 
 
 def plans_of_events(
@@ -167,11 +166,14 @@ def plans_of_events(
 
     Args:
         events, fragment: of `Recordings`, of one observer.
-        factor: the column that is compared.
+        factor: the column of the condition; None for none.
         reference: its level that comes first; None: the first by name.
-        context: columns of what is known before each action.
-        notes: what was said of the recordings; what is noticed here is added.
-        max_gap, num_actions, action_names, unknown: see there.
+        context: columns of what is observed before each action.
+        notes: of the recordings; further ones are added.
+        max_gap, num_actions, action_names, unknown: as of `Recordings.plans`.
+
+    Raises:
+        ValueError: as of `Recordings.plans`.
     """
     if unknown not in ("error", "gap"):
         raise ValueError(f"`unknown` must be error or gap, got {unknown!r}")
@@ -182,32 +184,30 @@ def plans_of_events(
         cut |= _pauses(events, cut, max_gap, notes)
     names = check_names(num_actions, action_names)
     behaviour = events["behaviour"].to_numpy(object)
-    outside = np.zeros(len(events), bool)
     labels = [str(label) for label in pd.unique(behaviour)]
     if all(label.isdecimal() for label in labels) and not (names is not None and set(labels) <= set(names)):
         actions = pd.to_numeric(events["behaviour"]).to_numpy(np.int64)
         count = num_actions or (int(actions.max()) + 1 if names is None else len(names))
         if names is not None:
             order = listed([f"{number} = {name}" for number, name in enumerate(names)])
-            notes.append(f"the behaviours are numbers, which are taken for those of the names: {order}")
+            notes.append(f"the behaviours are numbers, and are taken for those of the names: {order}")
         elif missing := sorted(set(range(min(count, 10_000))) - set(actions.tolist())):
             verb = "occurs" if len(missing) == 1 else "occur"
             notes.append(f"behaviours are numbers from 0 to {count - 1}, of which {listed(missing)} never {verb}")
-        outside = actions >= count
-        shown = f"0 to {count - 1}"
+        outside, expected = actions >= count, f"0 to {count - 1}"
     else:
         names = tuple(sorted(labels)) if names is None else names
-        count, shown = len(names), ", ".join(names)
+        count, expected = len(names), ", ".join(names)
         actions = pd.Index(list(names)).get_indexer(pd.Index(behaviour)).astype(np.int64)
         outside = actions < 0
     if outside.any() and unknown == "error":
-        label, row = behaviour[outside][0], events.iloc[int(outside.argmax())]
+        row, number = events.iloc[int(outside.argmax())], int(outside.sum())
         raise ValueError(
-            f"recording {row['recording']!r}: behaviour {label!r} is none of {shown} ({int(outside.sum()):,} events);"
+            f"recording {row['recording']!r}: behaviour {row['behaviour']!r} is none of {expected} ({number:,} events);"
             " --rename it, --drop it, or --unknown gap ends plans there"
         )
     if outside.any():
-        notes.append(f"{int(outside.sum()):,} events are of behaviours that are not known; plans end there")
+        notes.append(f"{int(outside.sum()):,} events are of none of the behaviours; plans end there")
         cut[1:] |= outside[:-1]
         whole = np.cumsum(cut | outside)[~outside]
         events, actions, cut = events[~outside], actions[~outside], np.diff(whole, prepend=-1) != 0
@@ -217,48 +217,48 @@ def plans_of_events(
     lengths = np.diff(np.append(starts, len(actions)))
     first = events.iloc[starts]
 
-    def wide(values: Any) -> Tensor:
+    def pad(values: Any) -> Tensor:
         return torch.from_numpy(padded(np.array(values), lengths, "recordings"))
 
     group, subjects = pd.factorize(first["subject"], sort=True)
-    alone = len(subjects) == len(first) and bool((events["subject"] == events["recording"]).all())
-    begun = events["start"].to_numpy(np.float64)
-    seconds = (events["stop"] - events["start"]).to_numpy(np.float32)
+    is_independent = len(subjects) == len(first) and bool((events["subject"] == events["recording"]).all())
+    began = events["start"].to_numpy(np.float64)
+    durations = (events["stop"] - events["start"]).to_numpy(np.float32)
     if reference is not None and factor is None:
         raise ValueError(f"`reference` must be a level of a factor, got {reference!r}; name the factor (--compare)")
-    fields: dict[str, Any] = _context_fields(context, events, wide, notes)
+    fields: dict[str, Any] = _context_fields(context, events, pad, notes)
     if factor is not None:
         names_of = sorted(pd.unique(first[factor]), key=lambda level: (level != reference, str(level)))
         if reference is not None and reference not in names_of:
             raise ValueError(f"`reference` must be one of {', '.join(names_of)}, got {reference!r}")
         codes, levels = pd.Index(names_of).get_indexer(pd.Index(first[factor])), names_of
         if (codes < 0).any() or "" in set(levels):
-            raise ValueError(f"`condition` must be known for each recording, got an empty {factor!r} in some")
+            raise ValueError(f"`condition` must be known for each recording, got empty cells of {factor!r}")
         fields |= {"condition": torch.from_numpy(codes.astype(np.int64)), "condition_names": tuple(map(str, levels))}
     return RecordedPlans(
-        wide(actions),
+        pad(actions),
         count,
         None if (lengths == lengths.max()).all() else torch.from_numpy(lengths),
         names,
-        # Recordings of which no subject is known, and which have no gaps, are plans that are independent.
-        group=None if alone else torch.from_numpy(group.astype(np.int64)),
-        group_names=None if alone else tuple(map(str, subjects)),
+        # Without subjects and gaps, each recording is one plan, and independent of the others.
+        group=None if is_independent else torch.from_numpy(group.astype(np.int64)),
+        group_names=None if is_independent else tuple(map(str, subjects)),
         recording=tuple(first["recording"]),
-        began=None if np.isnan(begun).all() else wide(begun),
-        durations=None if np.isnan(seconds).all() else wide(seconds),
+        began=None if np.isnan(began).all() else pad(began),
+        durations=None if np.isnan(durations).all() else pad(durations),
         notes=tuple(notes),
         **fields,
     )
 
 
 def _pauses(events: pd.DataFrame, cut: NDArray[np.bool_], max_gap: float, notes: list[str]) -> NDArray[np.bool_]:
-    """Return which events begin more than `max_gap` after all before them ended."""
+    """Return which events, bool `[events]`, begin more than `max_gap` after all events before them ended."""
     start = events["start"].to_numpy(np.float64)
     if np.isnan(start).all():
-        raise ValueError("`max_gap` must be left out where no times are known")
+        raise ValueError(f"`max_gap` must be None where no times are known, got {max_gap}")
     ends = events["stop"].fillna(events["start"])
     if unknown := int(events["stop"].isna().sum()):
-        notes.append(f"{unknown:,} events without a stop count for max_gap as ended when they began")
+        notes.append(f"{unknown:,} events have no stop; for max_gap they end when they begin")
     latest = ends.groupby(np.cumsum(cut)).cummax().to_numpy(np.float64)
     pause = np.zeros(len(start), bool)
     error = 4 * np.spacing(np.maximum(np.abs(start[1:]), np.abs(latest[:-1])))
@@ -267,11 +267,11 @@ def _pauses(events: pd.DataFrame, cut: NDArray[np.bool_], max_gap: float, notes:
 
 
 def _context_fields(
-    columns: Sequence[str], events: pd.DataFrame, wide: Callable[[Any], Tensor], notes: list[str]
+    columns: Sequence[str], events: pd.DataFrame, pad: Callable[[Any], Tensor], notes: list[str]
 ) -> dict[str, Any]:
-    """Return the context of each action: labels of one column, or features.
+    """Return the fields `context` and `context_names` of plans: labels of one column, or features.
 
-    One column is features where some of its numbers are negative or not whole, or nearly all are different.
+    One column of numbers is a feature where some are negative or not whole, or most are different.
     """
     if not columns:
         return {}
@@ -283,16 +283,16 @@ def _context_fields(
         if (empty := texts.eq("")).any():
             raise ValueError(f"`columns.context` must be known for each event, got {int(empty.sum()):,} empty cells")
         codes, labels = pd.factorize(texts, sort=True)
-        return {"context": wide(codes.astype(np.int64)), "context_names": tuple(map(str, labels))}
+        return {"context": pad(codes.astype(np.int64)), "context_names": tuple(map(str, labels))}
     values = numbers[0]
-    measured = (values < 0).any() or (values % 1 != 0).any() or len(np.unique(values)) > max(20, 0.5 * len(values))
-    if len(columns) == 1 and not measured:
-        return {"context": wide(values.astype(np.int64))}
-    for name, one in zip(columns, numbers, strict=True):
-        if not np.isfinite(one).all():
-            row = events.iloc[int((~np.isfinite(one)).argmax())]
+    is_measured = (values < 0).any() or (values % 1 != 0).any() or len(np.unique(values)) > max(20, 0.5 * len(values))
+    if len(columns) == 1 and not is_measured:
+        return {"context": pad(values.astype(np.int64))}
+    for name, column in zip(columns, numbers, strict=True):
+        if not np.isfinite(column).all():
+            row = events.iloc[int((~np.isfinite(column)).argmax())]
             raise ValueError(f"`columns.context` must be numbers in {name!r}, got {row[name]!r}")
     if len(columns) == 1:
-        notes.append(f"the context {columns[0]!r} is read as a measurement, not as one of several places")
+        notes.append(f"the context {columns[0]!r} is read as a measurement, not as a label")
     features = np.stack(numbers, 1)
-    return {"context": wide(as_single("context", features))}
+    return {"context": pad(as_single("context", features))}

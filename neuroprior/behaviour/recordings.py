@@ -12,29 +12,29 @@ if TYPE_CHECKING:  # torch is imported only where plans are wanted
     from neuroprior.behaviour.recorded_plans import RecordedPlans
 
 KEYS = ["recording", "subject"]
-"""What tells timelines apart: the session and who was watched in it."""
+"""Columns that tell timelines apart: the session, and who was watched in it."""
 
 MIN_NAME, MAX_NAMES = 4, 300
-"""Letters of the shortest names that are compared for slips of the pen, and the most names."""
+"""Fewest letters of names that are compared for slips of the pen, and most names."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where recordings were read from.
+    """A file or sheet that recordings were read from.
 
     Attributes:
         name: of the file.
         program: that wrote it, "" where it is not known.
         layout: of its rows.
         columns: names of columns by use.
-        found: uses that no user named.
+        inferred: uses that no user named.
     """
 
     name: str
     program: str
     layout: str
     columns: Mapping[str, tuple[str, ...]]
-    found: frozenset[str]
+    inferred: frozenset[str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +72,11 @@ class Recordings:
     spans: pd.DataFrame | None = None
 
     def __repr__(self) -> str:
-        """The numbers of what there is."""
+        """Return the numbers of events, recordings, subjects and behaviours."""
+        subjects, behaviours = self.events["subject"].nunique(), self.events["behaviour"].nunique()
         return (
-            f"Recordings({len(self.events):,} events, {self.num_recordings:,} recordings,"
-            f" {self.events['subject'].nunique():,}"
-            f" subjects, {self.events['behaviour'].nunique():,} behaviours)"
+            f"Recordings({len(self.events):,} events, {self.num_recordings:,} recordings, {subjects:,} subjects,"
+            f" {behaviours:,} behaviours)"
         )
 
     @property
@@ -86,11 +86,10 @@ class Recordings:
 
     @property
     def watched(self) -> pd.DataFrame:
-        """When each recording was watched: a frame with the columns `recording, subject, start, stop`, a row a
-        fragment.
+        """When each recording was watched: a frame with columns `recording, subject, start, stop`, a fragment a row.
 
-        A fragment is from the first frame to the last where rows are frames; else from the start of its first event to
-        the last stop in it (or the last start, where no stop is known).
+        Where rows are frames, a fragment lasts from the first to the last. Else it lasts from the start of its first
+        event to its last stop, or to its last start where no stop is known.
         """
         if self.spans is not None:
             return self.spans
@@ -101,25 +100,26 @@ class Recordings:
         )
         return whole.reset_index(drop=True)
 
-    def _with(self, events: pd.DataFrame, fragment: NDArray[Any], *notes: str) -> "Recordings":
+    def _replace_events(self, events: pd.DataFrame, fragment: NDArray[Any], *notes: str) -> "Recordings":
+        """Return recordings of other events, with their fragments numbered anew and further notes."""
         numbers = np.unique(fragment, return_inverse=True)[1].astype(np.int64)
         return replace(self, events=events.reset_index(drop=True), fragment=numbers, notes=(*self.notes, *notes))
 
     def drop(self, behaviours: Sequence[str]) -> "Recordings":
-        """Return the recordings without some behaviours; the time in which they were done stays watched.
+        """Return the recordings without some behaviours; the time that these took stays watched.
 
         Raises:
             ValueError: a behaviour that does not occur.
         """
-        wanted = [behaviours] if isinstance(behaviours, str) else list(behaviours)
-        known = set(self.events["behaviour"])
-        if wrong := [name for name in wanted if name not in known]:
-            raise ValueError(f"`drop` must be behaviours that occur ({_listed(sorted(known))}), got {wrong[0]!r}")
-        left = self.events["behaviour"].isin(wanted).to_numpy()
-        if left.all():
+        names = [behaviours] if isinstance(behaviours, str) else list(behaviours)
+        labels = set(self.events["behaviour"])
+        if wrong := [name for name in names if name not in labels]:
+            raise ValueError(f"`drop` must be behaviours that occur ({_join_names(sorted(labels))}), got {wrong[0]!r}")
+        dropped = self.events["behaviour"].isin(names).to_numpy()
+        if dropped.all():
             raise ValueError("`drop` must leave a behaviour, got all")
-        note = f"{left.sum():,} events of {_listed(wanted)} are left out"
-        return replace(self._with(self.events[~left], self.fragment[~left], note), spans=self.watched)
+        note = f"{dropped.sum():,} events of {_join_names(names)} are left out"
+        return replace(self._replace_events(self.events[~dropped], self.fragment[~dropped], note), spans=self.watched)
 
     def window(self, start: float | None = None, stop: float | None = None) -> "Recordings":
         """Return what lies between two times of each recording; events that reach over an end are cut there.
@@ -128,7 +128,7 @@ class Recordings:
             start, stop: in the unit of the recordings; None: without this end.
 
         Raises:
-            ValueError: nothing lies between them.
+            ValueError: no event lies between them.
         """
         low, high = -np.inf if start is None else start, np.inf if stop is None else stop
         begin, end = self.events["start"], self.events["stop"].fillna(self.events["start"])
@@ -141,10 +141,10 @@ class Recordings:
         watched = watched[(watched["start"] < high) & (watched["stop"] > low)].reset_index(drop=True)
         spans = watched.assign(start=watched["start"].clip(low, high), stop=watched["stop"].clip(low, high))
         note = f"{(~inside).sum():,} events outside of the window are left out"
-        return replace(self._with(events, self.fragment[inside], note), spans=spans)
+        return replace(self._replace_events(events, self.fragment[inside], note), spans=spans)
 
     def merge_repeats(self) -> "Recordings":
-        """Return the recordings with successive bouts of one behaviour, within a fragment, made one."""
+        """Return the recordings with successive bouts of one behaviour made one, within each fragment."""
         behaviour = pd.factorize(self.events["behaviour"])[0]
         new = (np.diff(behaviour, prepend=-1) != 0) | (np.diff(self.fragment, prepend=-1) != 0)
         run = np.cumsum(new)
@@ -152,23 +152,23 @@ class Recordings:
         events = self.events[new].assign(stop=last)
         unknown = self.events["stop"].isna().groupby(run).last().to_numpy()
         events["stop"] = np.where(unknown, np.nan, events["stop"])
-        return self._with(
+        return self._replace_events(
             events, self.fragment[new], f"{(~new).sum():,} events repeat the one before, and are one with it"
         )
 
     def until_next(self) -> "Recordings":
-        """Return the recordings with each stop that is not known at the start of the next event of the fragment."""
+        """Return the recordings with each unknown stop at the start of the next event of its fragment."""
         start = self.events["start"].to_numpy()
         following = np.append(start[1:], np.nan)
         following[np.append(np.diff(self.fragment) != 0, True)] = np.nan
         stop = self.events["stop"].fillna(pd.Series(following, index=self.events.index))
-        return self._with(self.events.assign(stop=stop), self.fragment)
+        return self._replace_events(self.events.assign(stop=stop), self.fragment)
 
     def behaviours(self) -> pd.DataFrame:
-        """Return a row a behaviour: how many events, in how many subjects, for how long, and what is odd about it."""
-        events = self.events.assign(seconds=self.events["stop"] - self.events["start"])
+        """Return a frame with a row a behaviour: its events, subjects, whole duration, and what is odd about it."""
+        events = self.events.assign(duration=self.events["stop"] - self.events["start"])
         table = events.groupby("behaviour").agg(
-            events=("behaviour", "size"), subjects=("subject", "nunique"), duration=("seconds", "sum")
+            events=("behaviour", "size"), subjects=("subject", "nunique"), duration=("duration", "sum")
         )
         table = table.sort_values("events", ascending=False, kind="stable")
         many, total = self.events["subject"].nunique(), len(self.events)
@@ -189,27 +189,27 @@ class Recordings:
         for level in sorted(pd.unique(self.events[factor])):
             inside = (self.events[factor] == level).to_numpy()
             pairs = self.events[inside][KEYS].drop_duplicates()
-            part = self._with(self.events[inside], self.fragment[inside])
+            part = self._replace_events(self.events[inside], self.fragment[inside])
             yield str(level), replace(part, spans=self.watched.merge(pairs, on=KEYS))
 
     def time_budget(self) -> pd.DataFrame:
         """Return the share of the watched time that each behaviour takes: rows are subjects, columns behaviours."""
         watched = self.watched
         time = (watched["stop"] - watched["start"]).groupby(watched["subject"]).sum()
-        seconds = self.events.assign(seconds=self.events["stop"] - self.events["start"])
-        table = seconds.pivot_table(
-            index="subject", columns="behaviour", values="seconds", aggfunc="sum", fill_value=0.0
+        events = self.events.assign(duration=self.events["stop"] - self.events["start"])
+        table = events.pivot_table(
+            index="subject", columns="behaviour", values="duration", aggfunc="sum", fill_value=0.0
         )
         return table.div(time.where(time > 0), axis=0)
 
     def agreement(self) -> pd.DataFrame:
-        """Return how well observers agree: Cohen's kappa over time of each behaviour, for each two observers.
+        """Return how well observers agree: Cohen's kappa over time, for each behaviour and two observers.
 
         Each moment that both watched is a case; a behaviour is done in it or not.
 
         Returns:
-            A frame with the columns `first, second, behaviour, kappa, agreement, time`: the share of the time in
-            which both say the same, and the time that both watched.
+            A frame with the columns `first, second, behaviour, kappa, agreement, time`. Agreement is the share of the
+            time in which both say the same; time is what both watched.
 
         Raises:
             ValueError: fewer than two observers, or unknown stops.
@@ -237,21 +237,18 @@ class Recordings:
         return total.assign(kappa=kappa, agreement=same)[["kappa", "agreement", "time"]].reset_index()
 
     def of_one_observer(self) -> "Recordings":
-        """Return the recordings with one observer for each recording and subject: who scored most events of"
-        " the study."""
+        """Return the recordings with one observer for each timeline: the one with most events in the study."""
         if "observer" not in self.events:
             return self
-        rank = self.events["observer"].value_counts()
-        score = self.events["observer"].map(rank)
-        best = score.groupby([self.events[key] for key in KEYS]).transform("max")
-        first = (
-            self.events["observer"].where(score == best).groupby([self.events[key] for key in KEYS]).transform("min")
-        )
-        kept = (self.events["observer"] == first).to_numpy()
+        observer, keys = self.events["observer"], [self.events[key] for key in KEYS]
+        num_events = observer.map(observer.value_counts())
+        most = num_events.groupby(keys).transform("max")
+        first = observer.where(num_events == most).groupby(keys).transform("min")
+        kept = (observer == first).to_numpy()
         if kept.all():
             return self
         note = f"{(~kept).sum():,} events of second observers are not among the plans"
-        return self._with(self.events[kept], self.fragment[kept], note)
+        return self._replace_events(self.events[kept], self.fragment[kept], note)
 
     def plans(
         self,
@@ -266,29 +263,29 @@ class Recordings:
         """Return the plans that priors learn from: one a fragment, with the subject as group.
 
         Args:
-            max_gap: a longer pause ends a plan, too; in the unit of the recordings.
+            max_gap: a longer pause ends a plan as well; in the unit of the recordings.
             condition: the factor that is compared; None: the only one, if there is one.
             reference: its level that others are compared with, such as "saline"; None: the first by name.
             num_actions: A, where behaviours are numbers; None: the largest + 1.
             action_names: A names in the order of their numbers; None: the behaviours that occur, sorted.
-            unknown: what behaviours do that are none of `action_names`: "error", or "gap": a plan ends there.
+            unknown: what a behaviour is that is none of `action_names`: an "error", or a "gap" where a plan ends.
 
         Raises:
-            ValueError: an argument is out of range, or a behaviour that is none of the names.
+            ValueError: an argument is out of range, or a behaviour is none of the names.
         """
         from neuroprior.behaviour.recorded_plans import plans_of_events
 
         if condition is not None and condition not in self.factors:
-            some = ", ".join(self.factors) or "none; name its column (--columns.factors)"
-            raise ValueError(f"`condition` must be a factor of the recordings, {some}, got {condition!r}")
-        kept = self.of_one_observer()
+            factors = ", ".join(self.factors) or "of which there is none; name its column (--columns.factors)"
+            raise ValueError(f"`condition` must be a factor of the recordings, {factors}, got {condition!r}")
+        recordings = self.of_one_observer()
         return plans_of_events(
-            kept.events,
-            kept.fragment,
+            recordings.events,
+            recordings.fragment,
             factor=condition or (self.factors[0] if len(self.factors) == 1 else None),
             reference=reference,
-            context=kept.context,
-            notes=list(kept.notes),
+            context=recordings.context,
+            notes=list(recordings.notes),
             max_gap=max_gap,
             num_actions=num_actions,
             action_names=action_names,
@@ -297,30 +294,31 @@ class Recordings:
 
 
 def _both_done(pair: pd.DataFrame, first: str, second: str) -> list[tuple[str, str, str, float, float, float, float]]:
-    """Return for each behaviour how long both observers, the one and the other say that it is done."""
-    mine, yours = (pair[pair["observer"] == name] for name in (first, second))
-    low = max(mine["start"].min(), yours["start"].min())
-    high = min(mine["stop"].max(), yours["stop"].max())
+    """Return for each behaviour how long both observers, the first and the second say that it is done."""
+    of_first, of_second = (pair[pair["observer"] == name] for name in (first, second))
+    low = max(of_first["start"].min(), of_second["start"].min())
+    high = min(of_first["stop"].max(), of_second["stop"].max())
     if not high > low:
         return []
     edges = np.unique(np.clip(np.concatenate([pair["start"], pair["stop"], [low, high]]), low, high))
     middle, width = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
     rows: list[tuple[str, str, str, float, float, float, float]] = []
     for behaviour in pd.unique(pair["behaviour"]):
-        done = [_is_done(one[one["behaviour"] == behaviour], middle) for one in (mine, yours)]
-        both, one, other = (float(width[some].sum()) for some in (done[0] & done[1], done[0], done[1]))
+        done, also = (_is_done(bouts[bouts["behaviour"] == behaviour], middle) for bouts in (of_first, of_second))
+        both, one, other = (float(width[moments].sum()) for moments in (done & also, done, also))
         rows.append((first, second, str(behaviour), both, one, other, float(high - low)))
     return rows
 
 
 def _is_done(bouts: pd.DataFrame, moments: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return at which moments a bout goes on, bool `[moments]`."""
     start, stop = np.sort(bouts["start"].to_numpy()), np.sort(bouts["stop"].to_numpy())
     done: NDArray[np.bool_] = np.searchsorted(start, moments, "right") > np.searchsorted(stop, moments, "right")
     return done
 
 
 def near_names(names: Sequence[str]) -> dict[str, list[str]]:
-    """Return names that are nearly equal to others: but for case, spaces and dashes, or one letter of four or more.
+    """Return names that nearly equal others: but for case, spaces and dashes, or for one letter of four or more.
 
     Example:
         >>> near_names(["Grooming", "Groming", "rear", "Rear", "walk"])
@@ -332,16 +330,16 @@ def near_names(names: Sequence[str]) -> dict[str, list[str]]:
     short = ["".join(letter for letter in name.casefold() if letter.isalnum()) for name in names]
     for i, one in enumerate(short):
         for j in range(i):
-            if (one == short[j] and one) or (
-                _one_letter_apart(one, short[j]) and not any(map(str.isdigit, one + short[j]))
-            ):
+            other = short[j]
+            is_typo = _one_letter_apart(one, other) and not any(map(str.isdigit, one + other))
+            if is_typo or (one and one == other):
                 close.setdefault(names[j], []).append(names[i])
                 close.setdefault(names[i], []).append(names[j])
     return {name: close[name] for name in names if name in close}
 
 
 def _one_letter_apart(one: str, other: str) -> bool:
-    """Whether one letter is missing, added, changed or exchanged with its neighbour."""
+    """Return whether one letter is missing, added, changed or exchanged with its neighbour."""
     if min(len(one), len(other)) < MIN_NAME or abs(len(one) - len(other)) > 1:
         return False
     start = next((i for i, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), min(len(one), len(other)))
@@ -349,5 +347,5 @@ def _one_letter_apart(one: str, other: str) -> bool:
     return a[1:] == b[1:] or a[1:] == b or a == b[1:] or (a[:2] == b[:2][::-1] and a[2:] == b[2:])
 
 
-def _listed(names: Sequence[str], shown: int = 8) -> str:
+def _join_names(names: Sequence[str], shown: int = 8) -> str:
     return ", ".join(names[:shown]) + (f" and {len(names) - shown} more" if len(names) > shown else "")

@@ -1,7 +1,8 @@
-"""`neuroprior check`: what files of behaviour are read as, before anything is computed."""
+"""`neuroprior check`: shows what files of behaviour are read as, before anything is computed."""
 
 import shlex
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import pandas as pd
 from rich.console import Console
@@ -9,21 +10,25 @@ from rich.table import Table
 
 from neuroprior.behaviour.reading import Options, ReadingError
 from neuroprior.behaviour.reading.read import read_recordings
-from neuroprior.behaviour.recordings import Recordings, Source
+from neuroprior.behaviour.recordings import KEYS, Recordings, Source
 from neuroprior.cli.reading import reading_words
 
 MAX_ROWS = 40
-"""Rows of a table that are shown; behaviours are shown all."""
+"""Rows at most that are shown of a table; of behaviours all are."""
 
-SHOWN_EVENTS = 8
+MAX_EVENTS = 8
+"""Events at most that are shown."""
 
 
 def check(files: list[str], reading: Options = Options()) -> None:  # noqa: B008
     """Show what files of behaviour are read as: columns, behaviours, subjects, gaps, and everything that is wrong.
 
     Args:
-        files: of one study: tables of events, frames or sequences; folders and globs as well.
+        files: tables of events, frames or sequences, folders or globs, of one study.
         reading: how they are read.
+
+    Raises:
+        ValueError: the files cannot be read; each problem is printed before.
     """
     console = Console(soft_wrap=True, highlight=False)
     try:
@@ -31,7 +36,7 @@ def check(files: list[str], reading: Options = Options()) -> None:  # noqa: B008
     except ReadingError as error:
         for problem in error.problems:
             console.print(f"problem: {problem}", markup=False)
-        raise ValueError(f"{len(error.problems)} problems, and nothing is read") from None
+        raise ValueError(f"nothing is read, because of {len(error.problems)} problems") from None
     for line in describe(recordings):
         console.print(line, markup=False) if isinstance(line, str) else console.print(line)
     words = [*files, *reading_words(reading)]
@@ -39,56 +44,52 @@ def check(files: list[str], reading: Options = Options()) -> None:  # noqa: B008
 
 
 def describe(recordings: Recordings) -> Iterator[str | Table]:
-    """Return what is shown of recordings, line by line and table by table."""
-    yield from _sources(recordings.sources)
+    """Yield what is shown of recordings, line by line and table by table."""
+    yield from _describe_sources(recordings.sources)
     events, watched = recordings.events, recordings.watched
-    unit = recordings.unit or "units"
-    time = float((watched["stop"] - watched["start"]).sum())
     yield (
-        f"{len(events):,} events of {events['behaviour'].nunique():,} behaviours, {recordings.num_recordings:,}"
-        " recordings"
-        f" of {events['subject'].nunique():,} subjects"
+        f"{len(events):,} events of {events['behaviour'].nunique():,} behaviours,"
+        f" {recordings.num_recordings:,} recordings of {events['subject'].nunique():,} subjects"
     )
-    gaps = len(watched) - len(watched[["recording", "subject"]].drop_duplicates())
-    known = "no times are known" if watched["start"].isna().all() else f"{time:,.6g} {unit} watched"
-    yield f"{known}, {gaps:,} gaps"
+    gaps = len(watched) - len(watched[KEYS].drop_duplicates())
+    time = f"{float((watched['stop'] - watched['start']).sum()):,.6g} {recordings.unit or 'units'} watched"
+    yield f"{'no times are known' if watched['start'].isna().all() else time}, {gaps:,} gaps"
     for note in recordings.notes:
         yield f"note: {note}"
     if recordings.empty:
         yield f"recordings without events: {', '.join(recordings.empty[:MAX_ROWS])}"
     yield _table("Behaviours", recordings.behaviours(), all_rows=True)
     for factor in recordings.factors:
-        counts = (
-            events.drop_duplicates(["recording", "subject"]).groupby(["subject", factor]).size().unstack(fill_value=0)
-        )
+        counts = events.drop_duplicates(KEYS).groupby(["subject", factor]).size().unstack(fill_value=0)
         yield _table(f"Recordings by {factor}", _with_total(counts).reset_index())
-    first = events[
-        (events["recording"] == events["recording"].iloc[0]) & (events["subject"] == events["subject"].iloc[0])
-    ]
-    yield _table("The first events", first.head(SHOWN_EVENTS))
+    first = events[events[KEYS].eq(events[KEYS].iloc[0]).all(axis=1)]
+    yield _table("The first events", first.head(MAX_EVENTS))
 
 
 def _with_total(counts: pd.DataFrame) -> pd.DataFrame:
     """Return a table of recordings with the number of subjects of each level as its last row."""
-    return pd.concat(
-        [counts, pd.DataFrame({level: [(counts[level] > 0).sum()] for level in counts}, index=["subjects"])]
-    ).rename_axis("subject")
+    total = (counts > 0).sum().to_frame("subjects").T
+    return pd.concat([counts, total]).rename_axis("subject")
 
 
-def _sources(sources: Sequence[Source]) -> Iterator[str | Table]:
-    """Return as what the files were read; files that were read alike share a line."""
+def _describe_sources(sources: Sequence[Source]) -> Iterator[str | Table]:
+    """Yield what the files were read as; files that were read alike share a line."""
     kinds: dict[tuple[str, str, str], list[Source]] = {}
     for source in sources:
         kinds.setdefault((source.program, source.layout, str(source.columns)), []).append(source)
-    for (program, layout, _), some in kinds.items():
-        names = ", ".join(one.name for one in some[:3]) + (f" and {len(some) - 3} more" if len(some) > 3 else "")
+    for (program, layout, _), alike in kinds.items():
+        names = ", ".join(one.name for one in alike[:3]) + (f" and {len(alike) - 3} more" if len(alike) > 3 else "")
         yield f"{names}: {program or 'a table'}, {layout}"
         rows = [
-            (use, _shorten(columns), "found" if use in some[0].found else "named")
-            for use, columns in some[0].columns.items()
+            (use, _shorten(columns), "found" if use in alike[0].inferred else "named")
+            for use, columns in alike[0].columns.items()
             if columns
         ]
         yield _table("Columns", pd.DataFrame(rows, columns=["use", "column", ""]))
+
+
+def _format_cell(value: Any) -> str:
+    return "" if value is None else f"{value:,.6g}" if isinstance(value, float) else str(value)
 
 
 def _shorten(names: Sequence[str]) -> str:
@@ -96,16 +97,14 @@ def _shorten(names: Sequence[str]) -> str:
 
 
 def _table(title: str, frame: pd.DataFrame, all_rows: bool = False) -> Table:
+    """Return a table of `rich`, with its first `MAX_ROWS` rows or all."""
     table = Table(title=title, title_justify="left", box=None, padding=(0, 2, 0, 0))
     shown = frame if all_rows else frame.head(MAX_ROWS)
     for name in frame.columns:
-        table.add_column(
-            str(name), justify="right" if pd.api.types.is_numeric_dtype(frame[name]) else "left", overflow="fold"
-        )
+        numeric = pd.api.types.is_numeric_dtype(frame[name])
+        table.add_column(str(name), justify="right" if numeric else "left", overflow="fold")
     for row in shown.itertuples(index=False):
-        table.add_row(
-            *("" if value is None else f"{value:,.6g}" if isinstance(value, float) else str(value) for value in row)
-        )
+        table.add_row(*map(_format_cell, row))
     if len(shown) < len(frame):
         table.add_row(f"... {len(frame) - len(shown):,} more")
     return table

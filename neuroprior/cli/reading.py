@@ -1,4 +1,4 @@
-"""Options of the commands that say how recordings are read."""
+"""Options of commands for how recordings are read."""
 
 import inspect
 from collections.abc import Mapping, Sequence
@@ -10,25 +10,20 @@ from neuroprior.behaviour.reading import Columns, Options
 T = TypeVar("T", bound=Options)
 
 SPELLED = {"from_": "from"}
-"""Options whose names are words of Python."""
+"""Options whose names would be keywords of Python, as a command line spells them."""
 
 
 def add_reading_arguments(parser: Any, kind: type[Options]) -> None:
-    """Add an option to a parser (jsonargparse's) for each of `kind` and, as `--columns.NAME`, of `Columns`."""
-    texts = {
-        **_described(kind),
-        **_described(Options),
-        **{f"columns.{name}": text for name, text in _described(Columns).items()},
-    }
+    """Add an option to a parser of jsonargparse for each field of `kind` and, as `--columns.NAME`, of `Columns`."""
+    texts = _describe_attributes(Columns)
     for field in fields(Columns):
-        name = f"columns.{field.name}"
-        parser.add_argument(f"--{name}", nargs="+", type=str, default=None, help=texts[name])
-    hints = get_type_hints(kind)
+        parser.add_argument(f"--columns.{field.name}", nargs="+", type=str, default=None, help=texts[field.name])
+    texts, hints = _describe_attributes(kind) | _describe_attributes(Options), get_type_hints(kind)
     for field in fields(kind):
-        hint, text = hints[field.name], texts[field.name]
-        flag = f"--{SPELLED.get(field.name, field.name)}"
         if field.name == "columns":
             continue
+        hint, text = hints[field.name], texts[field.name]
+        flag = f"--{SPELLED.get(field.name, field.name)}"
         if get_origin(hint) is Mapping:
             parser.add_argument(flag, nargs="+", type=str, default=None, help=f"{text} As OLD=NEW.")
         elif Sequence in {get_origin(one) for one in (hint, *get_args(hint))}:
@@ -37,39 +32,38 @@ def add_reading_arguments(parser: Any, kind: type[Options]) -> None:
             parser.add_argument(flag, type=hint, default=field.default, help=text)
 
 
-def _described(kind: type) -> dict[str, str]:
-    """Return what the docstring of a class says of its attributes."""
+def _describe_attributes(kind: type) -> dict[str, str]:
+    """Return what the docstring of a class says of each attribute."""
     from docstring_parser import parse
 
     entries = parse(inspect.getdoc(kind) or "").params
-    found = {name.strip(): entry for entry in entries for name in entry.arg_name.split(",")}
-    return {name: " ".join((entry.description or "").split()).capitalize() for name, entry in found.items()}
+    entry_of = {name.strip(): entry for entry in entries for name in entry.arg_name.split(",")}
+    return {name: " ".join((entry.description or "").split()).capitalize() for name, entry in entry_of.items()}
 
 
 def pop_reading(settings: dict[str, Any], kind: type[T]) -> T:
-    """Take the options that `add_reading_arguments` added out of the settings of a command.
+    """Take what `add_reading_arguments` added out of the settings of a command, and return the options.
 
     Raises:
         ValueError: an option is out of range.
     """
     columns = {use: names[0] if len(names) == 1 else names for use, names in settings.pop("columns").items() if names}
-    given: dict[str, Any] = {"columns": columns}
+    options: dict[str, Any] = {"columns": columns}
     for field in fields(kind):
         value = settings.pop(SPELLED.get(field.name, field.name), None)
-        if value is None:
-            continue
-        given[field.name] = _pairs(field.name, value) if field.name in ("words", "rename") else value
-    return kind(**given)
+        if value is not None:
+            options[field.name] = _parse_pairs(field.name, value) if field.name in ("words", "rename") else value
+    return kind(**options)
 
 
-def _pairs(name: str, texts: Sequence[str]) -> dict[str, str]:
+def _parse_pairs(name: str, texts: Sequence[str]) -> dict[str, str]:
     if wrong := [text for text in texts if "=" not in text]:
-        raise ValueError(f"`{name}` must be given as OLD=NEW, got {wrong[0]!r}")
+        raise ValueError(f"`{name}` must be OLD=NEW, got {wrong[0]!r}")
     return {old: new for old, _, new in (text.partition("=") for text in texts)}
 
 
 def reading_words(options: Options) -> list[str]:
-    """Return options as words of a command line, those that have their default values left out."""
+    """Return options as words of a command line, without those at their defaults."""
     words: list[str] = []
     assert isinstance(options.columns, Columns)
     for use, names in options.columns.named().items():

@@ -1,4 +1,4 @@
-"""Reading recordings from the files of laboratories; without torch."""
+"""Reads recordings from the files of laboratories; imports no torch."""
 
 from neuroprior.behaviour.reading.columns import Columns
 from neuroprior.behaviour.reading.options import Options

@@ -16,25 +16,23 @@ TOGETHER = "+"
 """Between behaviours that are done at once."""
 
 MIN_FRAME_REPEATS = 0.6
-"""Share of rows with the label of the row before, at least which rows at equal steps are frames, where no name says so:
-of two labels at random half do.
-"""
+"""As `MIN_REPEATS`, where no name says that rows are frames: of two labels at random, half repeat."""
 
 MIN_REGULAR = 0.9
-"""Share of steps between rows that are equal, at least, where rows are frames."""
+"""Share of equal steps between rows, above which rows are frames."""
 
 MAX_CHANNEL_LABELS = 40
-"""Labels of a column beside that of the behaviours, at most, where it is another channel of them."""
+"""Different labels at most of a column that is another channel of behaviours."""
 
 
 def number_rows(table: Table) -> Floats:
-    """Return the number of each row within its recording, from 0: frames without a time."""
-    found: Floats = pd.Series(np.zeros(table.size)).groupby(table.unit_codes()).cumcount().to_numpy().astype(np.float64)
-    return found
+    """Return the number of each row within its recording, from 0, float64 `[rows]`: the time of frames without one."""
+    numbers = pd.Series(np.zeros(table.size)).groupby(table.unit_codes()).cumcount()
+    return np.asarray(numbers, np.float64)
 
 
 def are_frames(table: Table, start: Floats, labels: NDArray[Any]) -> bool:
-    """Whether rows are frames: at equal steps, and many with the label of the row before."""
+    """Return whether rows are frames: at equal steps, and many with the label of the row before."""
     if table.roles.program and table.roles.program.layout == "rows of frames":
         return True
     unit = table.unit_codes()
@@ -45,19 +43,17 @@ def are_frames(table: Table, start: Floats, labels: NDArray[Any]) -> bool:
     repeats = float((labels[1:] == labels[:-1])[same].mean())
     # Events have labels: blank ones at equal steps are frames in which nothing is done.
     sure = table.unit == "frames" or float((labels == "").mean()) > 0.05
-    return _usual_step(table, np.diff(start[order])[same]) is not None and repeats > (
-        MIN_REPEATS if sure else MIN_FRAME_REPEATS
-    )
+    threshold = MIN_REPEATS if sure else MIN_FRAME_REPEATS
+    return _usual_step(table, np.diff(start[order])[same]) is not None and repeats > threshold
 
 
 def _usual_step(table: Table, steps: Floats) -> float | None:
-    """Return the step between frames, to the rounding of their times; None where steps differ."""
+    """Return the mean step between frames; None where steps differ by more than the rounding of times."""
     if not len(steps):
         return None
     step = float(np.median(steps))
-    rounding = (
-        smallest_unit(table.frame[table.roles.at["start"][-1]].to_numpy(object)) if table.roles.at.get("start") else 0
-    )
+    names = table.roles.at.get("start")
+    rounding = smallest_unit(table.frame[names[-1]].to_numpy(object)) if names else 0
     near = np.abs(steps - step) <= max(0.02 * step, min(1.01 * rounding, 0.5 * step))
     if step <= 0:
         return None
@@ -74,8 +70,8 @@ def read_channels(table: Table, start: Floats, channels: Sequence[NDArray[Any]],
     Args:
         table: the table.
         start: float64 `[rows]`, when each frame begins.
-        channels: `[rows]` each, labels; "" where nothing is done.
-        lost: bool `[rows]`, frames of which nothing is known.
+        channels: labels, str `[rows]` each; "" where nothing is done.
+        lost: bool `[rows]`, frames that were not scored.
     """
     unit = table.unit_codes()
     order = np.lexsort((np.arange(table.size), start, unit))
@@ -91,26 +87,26 @@ def read_channels(table: Table, start: Floats, channels: Sequence[NDArray[Any]],
         after[:-1][hole[1:]] = when[:-1][hole[1:]] + step
         begin |= hole
         unit_name = table.unit or "in the unit of the time"
-        table.notes.append(f"each row is a frame of {step:.4g} {unit_name}: runs of one label are read as bouts")
+        table.notes.append(f"each row is a frame, of length {step:.4g} {unit_name}: runs of one label are bouts")
     else:
-        table.notes.append("rows say when something changes: a label lasts until the next row")
+        table.notes.append("rows are not at equal steps: each label lasts until the next row")
     stretch = np.cumsum(begin | np.append(False, lost[1:] != lost[:-1]))
-    found: list[tuple[Any, ...]] = []
+    bouts: list[tuple[Any, ...]] = []
     for labels in channels:
         label = labels[order]
         first = np.flatnonzero(np.append(True, (label[1:] != label[:-1]) | (np.diff(stretch) != 0)))
         last = np.append(first[1:] - 1, len(order) - 1)
         kept = (label[first] != "") & ~lost[first]
         first, last = first[kept], last[kept]
-        found.append((order[first], label[first], when[first], after[last], stretch[first]))
-    rows, names, starts, stops, stretches = (np.concatenate(columns) for columns in zip(*found, strict=True))
+        bouts.append((order[first], label[first], when[first], after[last], stretch[first]))
+    rows, names, starts, stops, stretches = (np.concatenate(columns) for columns in zip(*bouts, strict=True))
     part = table.part(rows.astype(np.int64), names, starts, stops, stretches)
-    # What was watched does not begin with the first behaviour, but with the first frame.
-    seen = pd.DataFrame({
+    # What was watched begins with the first frame, not with the first behaviour.
+    frames = pd.DataFrame({
         "recording": table.recording[order], "subject": table.subject[order], "stretch": stretch,
         "start": when, "stop": after,
     })[~lost]  # fmt: skip
-    spans = seen.groupby("stretch", sort=False).agg(
+    spans = frames.groupby("stretch", sort=False).agg(
         recording=("recording", "first"), subject=("subject", "first"), start=("start", "min"), stop=("stop", "max")
     )
     return replace(part, spans=spans.reset_index(drop=True))
@@ -129,54 +125,49 @@ def rows_of_frames(table: Table) -> Part:
 
 
 def read_labelled_frames(table: Table, start: Floats, labels: NDArray[Any]) -> Part:
-    """Read frames with a label each, and with other columns of labels as further channels.
+    """Read frames with one label each; other columns of labels are further channels.
 
-    An empty cell says that nothing was done; a word for missing, that nobody knows.
+    In an empty cell nothing was done. A word for missing says that the frame was not scored.
     """
     names = table.roles.at["behaviour"]
     blank = table.joined(names) == ""
     lost = (labels == "") & (table.options.missing == "gap" if table.options.missing else ~blank)
-    if lost.any():
-        row = table.place(int(lost.argmax()))
-        table.notes.append(f"{int(lost.sum()):,} frames have no label (first in {row}): nothing is known of them")
-    others = _other_channels(table) if "behaviour" in table.roles.found else {}
-    channels = [labels]
-    if others:
-        called = {names[0]: labels, **{name: table.labels(table.frame[name].to_numpy(object)) for name in others}}
-        sets = [set(pd.unique(one)) - {""} for one in called.values()]
-        shared = sum(map(len, sets)) > len(set().union(*sets))
-        if shared:  # the same label in two channels is not the same behaviour
-            called = {
-                name: np.array([label and f"{name}: {label}" for label in one], object) for name, one in called.items()
-            }
-        channels = list(called.values())
-        table.roles.at["behaviour"] = list(called)
-        table.first_notes.append(f"the columns {', '.join(called)} hold labels at each frame: each is read for itself")
-        lost = np.zeros(table.size, bool)
-    elif (blank & ~lost).any() and table.options.missing != "label":
-        table.notes.append("frames with an empty cell were watched, and nothing was scored in them")
-    return read_channels(table, start, channels, lost)
+    others = _other_channels(table) if "behaviour" in table.roles.inferred else []
+    if not others:
+        if lost.any():
+            row = table.place(int(lost.argmax()))
+            table.notes.append(f"{int(lost.sum()):,} frames have no label (first in {row}): nothing is known of them")
+        if (blank & ~lost).any() and table.options.missing != "label":
+            table.notes.append("frames with an empty cell were watched, and nothing was scored in them")
+        return read_channels(table, start, [labels], lost)
+    channels = {names[0]: labels, **{name: table.labels(table.frame[name].to_numpy(object)) for name in others}}
+    sets = [set(pd.unique(channel)) - {""} for channel in channels.values()]
+    if sum(map(len, sets)) > len(set().union(*sets)):  # the same label in two channels is not the same behaviour
+        for name, channel in channels.items():
+            channels[name] = np.array([label and f"{name}: {label}" for label in channel], object)
+    table.roles.at["behaviour"] = list(channels)
+    table.first_notes.append(f"the columns {', '.join(channels)} hold labels at each frame: each is read for itself")
+    return read_channels(table, start, list(channels.values()), np.zeros(table.size, bool))
 
 
 def _other_channels(table: Table) -> list[str]:
     """Return columns without a use that hold a few labels in runs, as that of the behaviours does."""
     used = table.roles.used()
-    unit = table.unit_codes()
-    same = np.diff(unit) == 0
-    found = []
+    same = np.diff(table.unit_codes()) == 0
+    names = []
     for name in table.frame:
         cells = table.frame[name]
         words = pd.unique(cells[cells != ""])
         if name in used or not 1 <= len(words) <= MAX_CHANNEL_LABELS:
             continue
-        if {str(word).lower() for word in words} <= INDICATORS:
+        if {word.lower() for word in words} <= INDICATORS:
             continue
         is_text = pd.to_numeric(pd.Series(words, dtype=object), errors="coerce").isna().all()
         values = cells.to_numpy(object)
         changes = (values[1:] != values[:-1])[same]
         if is_text and changes.any() and (~changes).mean() > MIN_REPEATS:
-            found.append(str(name))
-    return found
+            names.append(str(name))
+    return names
 
 
 def columns_of_behaviours(table: Table) -> Part:
@@ -199,7 +190,7 @@ def columns_of_behaviours(table: Table) -> Part:
     start = number_rows(table) if times is None else times.values
     if times is None:
         table.unit = "frames"
-    shown = [table.options.label(name) for name in names]
+    labels = [table.options.label(name) for name in names]
     several = int((on.sum(1) > 1).sum())
     never = [name for name, column in zip(names, on.T, strict=True) if not column.any()]
     if never:
@@ -213,13 +204,12 @@ def columns_of_behaviours(table: Table) -> Part:
                 f"{several:,} of {table.size:,} rows have several behaviours at once; each is read for itself"
                 " (--overlaps join reads them as one)"
             )
-        channels = [np.where(column, name, "").astype(object) for name, column in zip(shown, on.T, strict=True)]
+        channels = [np.where(column, name, "").astype(object) for name, column in zip(labels, on.T, strict=True)]
         return read_channels(table, start, channels, unscored)
     kinds, inverse = np.unique(on, axis=0, return_inverse=True)
-    words = [TOGETHER.join(name for name, yes in zip(shown, kind, strict=True) if yes and name) for kind in kinds]
+    words = [TOGETHER.join(name for name, yes in zip(labels, kind, strict=True) if yes and name) for kind in kinds]
     if several:
-        some = next(word for word in words if TOGETHER in word)
-        table.first_notes.append(
-            f"{several:,} of {table.size:,} rows have several behaviours, read as one, as {some!r}"
-        )
+        example = next(word for word in words if TOGETHER in word)
+        what = f"rows have several behaviours at once, read as one, such as {example!r}"
+        table.first_notes.append(f"{several:,} of {table.size:,} {what}")
     return read_channels(table, start, [np.array(words, dtype=object)[inverse.ravel()]], unscored)

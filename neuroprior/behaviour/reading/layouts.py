@@ -1,4 +1,4 @@
-"""The layouts of tables, each read as events."""
+"""The layouts of tables, and what reads each."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Names of columns that are known: what each usually holds, and the exports of programs."""
+"""Usual names of columns, and the columns of programs' exports."""
 
 import re
 import unicodedata
@@ -59,11 +59,11 @@ NAMES: dict[str, tuple[str, ...]] = {
         "cohort", "line", "diet", "season", "day", "experimental group", "treatment group",
     ),
 }  # fmt: skip
-"""Words for each use of a column, the surest first, as `plain` writes them."""
+"""Names of the columns for each use, the surest first, as `plain` writes them."""
 
 
 def plain(name: str) -> str:
-    """Return a column's name in lower case, without punctuation between words and without its unit.
+    """Return a column's name in lower case, without accents, punctuation between words, and unit.
 
     Example:
         >>> plain("Start (s)"), plain("case:concept:name"), plain("onset_s")
@@ -79,12 +79,12 @@ KNOWN_NAMES = frozenset(name for names in NAMES.values() for name in names)
 
 
 class Program(NamedTuple):
-    """An export that is known by its columns.
+    """A kind of export that its columns identify.
 
     Attributes:
         name: of the program and its kind of file.
-        needs: columns that it has, as `plain` writes them.
-        columns: for each use the column; names in the order of preference.
+        needs: columns that identify it, as `plain` writes them.
+        columns: for each use the names of its column, in the order of preference.
         layout: of its rows; "" where it follows from the columns.
         unit: of its times; "" where the columns say it.
     """
@@ -135,11 +135,11 @@ PROGRAMS: tuple[Program, ...] = (
     _program("Raven, selection table", "selection|view|begin time|end time", recording="begin file", start="begin time",
              stop="end time", behaviour="annotation|species|call type|label|call|type|code|notes"),
 )  # fmt: skip
-"""The first whose columns a file has all of is taken."""
+"""The first counts of which a file has all columns."""
 
 SIMBA = _program("SimBA, machine results", "", "columns of behaviours", "frames")
 DEEPETHOGRAM = _program("DeepEthogram, labels", "background", "columns of behaviours", "frames")
-"""Programs that are known by how their columns of zeros and ones are named."""
+"""Programs that the names of their columns of zeros and ones identify."""
 
 WORDS = {
     "start": ("start", "state start", "begin", "began", "onset", "on", "started", "state begin", "beginn", "an"),
@@ -147,22 +147,22 @@ WORDS = {
              "finished", "completed", "ende"),
     "point": ("point", "instant", "point event", "state point"),
 }  # fmt: skip
-"""Words for the kinds of rows where starts and stops are rows of their own, in lower case."""
+"""Words for the kinds of rows where starts and stops have rows of their own, in lower case."""
 
 MISSING_WORDS = (
     "", "nan", "na", "n/a", "n.a.", "<na>", "null", "?", "-", "#n/a", "#value!", "#ref!", "#name?", "#div/0!",
     "#num!",
 )  # fmt: skip
-"""What stands for no label, in lower case."""
+"""Words for no label, in lower case."""
 
 SUMMARY = re.compile(r"\b(?:total|mean|median|average|std|sd|number|frequency|occurr?ences)\b")
-"""In the names of columns of tables that sum events up."""
+"""Occurs in names of columns that sum events up."""
 
 TOTALS = ("total", "totals", "sum", "gesamt", "summe")
 """What stands for a behaviour in a row that sums up those above it, in lower case."""
 
 SEQUENCE_MISSING = ("*", "%")
-"""States of TraMineR's sequences that stand for none."""
+"""States of TraMineR's sequences that stand for no state."""
 
 NO_SUBJECT = ("no focal subject",)
-"""What a program writes where no subject was chosen, in lower case."""
+"""Words of programs for no subject, in lower case."""

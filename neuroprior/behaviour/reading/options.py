@@ -13,7 +13,7 @@ Overlaps = Literal["error", "keep", "join"]
 Ends = Literal["auto", "inclusive", "exclusive", "next"]
 
 UNLABELLED = "missing"
-"""The behaviour of rows without a label, where these are to count as one."""
+"""The behaviour of rows without a label, where `missing` is "label"."""
 
 
 @dataclass(frozen=True)
@@ -22,18 +22,18 @@ class Options:
 
     Attributes:
         columns: which columns hold what; those that are not named are found by their names.
-        missing: what rows without a label say: nobody knows ("gap": a fragment ends), that nothing was done
-            ("nothing"), that they are a behaviour ("label"), or that the file is wrong ("error"). None: a gap, but for
-            empty cells of frames, in which nothing was done.
+        missing: what a row without a label says: nobody knows ("gap": a fragment ends), nothing was done ("nothing"),
+            it is a behaviour ("label"), or the file is wrong ("error"). None: a gap, but for empty cells of frames, in
+            which nothing was done.
         missing_words: labels that stand for none, beside the empty cell.
-        unpaired: what starts without a stop do, and stops without a start: "error", "drop" both, or keep "open" starts.
-        overlaps: bouts of one behaviour of one subject that overlap are an "error", or kept ("keep"); "join" reads
-            behaviours that are done at once, in columns of zeros and ones, as one behaviour ("groom+rear").
-        ends: whether stops are the last unit of a bout ("inclusive") or the first after it ("exclusive"); "auto": as
-            the file shows; "next": each behaviour lasts until the next one begins, where only starts are known.
+        unpaired: starts without a stop, and stops without a start: an "error", "drop" both, or keep "open" starts.
+        overlaps: overlapping bouts of one behaviour of one subject: an "error", or "keep"; "join" reads behaviours
+            done at once, in columns of zeros and ones, as one ("groom+rear").
+        ends: whether a stop is the last unit of a bout ("inclusive") or the first after it ("exclusive"); "auto": as
+            the file shows; "next": a stop that is not known is the next start.
         day_first: whether 1/2/2024 is the first of February; None: as the file shows.
-        words: of rows of starts and stops, such as `{"in": "start", "out": "stop"}`.
-        merge_repeats: make one bout of successive ones of the same behaviour.
+        words: what words say that a row is: start, stop or point, such as `{"in": "start", "out": "stop"}`.
+        merge_repeats: make successive bouts of one behaviour one.
         from_, to: read only what lies between these times of each recording, in its unit.
         drop: behaviours to leave out.
         rename: behaviours and their new names; several may get the same.
@@ -63,20 +63,19 @@ class Options:
     def __post_init__(self) -> None:
         object.__setattr__(self, "columns", make_columns(self.columns))
         for name, kinds in (("missing", Missing), ("unpaired", Unpaired), ("overlaps", Overlaps), ("ends", Ends)):
-            if getattr(self, name) not in get_args(kinds) and not (name == "missing" and self.missing is None):
-                raise ValueError(f"`{name}` must be one of {', '.join(get_args(kinds))}, got {getattr(self, name)!r}")
+            value = getattr(self, name)
+            if value not in get_args(kinds) and not (name == "missing" and value is None):
+                raise ValueError(f"`{name}` must be one of {', '.join(get_args(kinds))}, got {value!r}")
         for name in ("missing_words", "drop"):
-            if isinstance(getattr(self, name), str):
-                object.__setattr__(self, name, (getattr(self, name),))
+            if isinstance(value := getattr(self, name), str):
+                object.__setattr__(self, name, (value,))
         if wrong := set(self.words.values()) - {"start", "stop", "point"}:
-            raise ValueError(f"`words` must stand for start, stop or point, got {sorted(wrong)[0]!r}")
+            raise ValueError(f"`words` must map to start, stop or point, got {sorted(wrong)[0]!r}")
         if self.from_ is not None and self.to is not None and not self.from_ < self.to:
             raise ValueError(f"`from_` must be below `to`, got {self.from_} and {self.to}")
-        object.__setattr__(self, "_absent", frozenset(word.lower() for word in ("", *self.missing_words)))
 
     def label(self, text: str) -> str:
         """Return the label that a text stands for; "" for none."""
-        absent: frozenset[str] = self._absent  # type: ignore[attr-defined]
-        if text.lower() in absent and text not in self.rename:
+        if text.lower() in {"", *map(str.lower, self.missing_words)} and text not in self.rename:
             return UNLABELLED if self.missing == "label" else ""
         return self.rename.get(text, text)

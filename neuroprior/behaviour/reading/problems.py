@@ -1,9 +1,9 @@
-"""Problems of files: all that are found in one run, each with its first rows and how many there are."""
+"""Problems of files: all of one run, each with its first rows and their number; lists of names for messages."""
 
 from collections.abc import Callable, Sequence
 
 SHOWN_ROWS = 3
-"""Rows that a problem names; the others are counted."""
+"""Rows at most that a problem names; the others are counted."""
 
 Place = Callable[[int], str]
 """Where a row stands, by its position: "study.csv, line 7"."""
@@ -13,7 +13,7 @@ class ReadingError(ValueError):
     """Files that cannot be read as recordings.
 
     Attributes:
-        problems: a line each; the message has them one behind the other.
+        problems: a line each; the message joins them.
 
     Example:
         >>> ReadingError(["a.csv: the file must hold a table", "b.csv: the file must hold a table"]).problems[1]
@@ -42,8 +42,8 @@ class Problems:
         """Add a problem that some rows have.
 
         Args:
-            what: what is wrong in the first of them, what it holds and what to do.
-            rows: their positions, in order; one at least.
+            what: what is wrong in the first row, what it holds and what to do.
+            rows: positions of all such rows, in order; at least one.
             place: where a row stands.
         """
         others = ""
@@ -53,6 +53,6 @@ class Problems:
         self.lines.append(f"{place(int(rows[0]))}: {what}{others}")
 
     def stop(self) -> None:
-        """Raise ReadingError where there are problems."""
+        """Raise ReadingError if there are problems."""
         if self.lines:
             raise ReadingError(self.lines)

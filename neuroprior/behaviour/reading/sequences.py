@@ -9,16 +9,16 @@ import pandas as pd
 from neuroprior.behaviour.reading.names import SEQUENCE_MISSING, plain
 from neuroprior.behaviour.reading.table import MIN_REPEATS, Part, Table
 
-SPS = re.compile(r"\(?([^(),]+),\s*(\d+(?:\.\d+)?)\)?")
-SPLITS = (" > ", "->", "-", "|", ";", ",", " ", "/")
-"""Between the behaviours of a sequence that stands in one cell."""
+STATE_AND_DURATION = re.compile(r"\(?([^(),]+),\s*(\d+(?:\.\d+)?)\)?")
+SEPARATORS = (" > ", "->", "-", "|", ";", ",", " ", "/")
+"""Separators of behaviours in a sequence in one cell."""
 
-MIN_SPLIT = 0.3
-"""Share of cells with a separator, at least, where cells are sequences."""
+MIN_SEPARATED = 0.3
+"""Share of cells with a separator, at least, for cells to be sequences."""
 
 
 def rows_of_sequences(table: Table) -> Part:
-    """Read one row a sequence, a behaviour in each column; empty cells behind the last one are its end."""
+    """Read one row a sequence, with a behaviour in each column; it ends with the last filled cell."""
     names = table.roles.at["behaviour"]
     cells = table.frame[names].to_numpy(object)
     cells = np.where(np.isin(cells, SEQUENCE_MISSING), "", cells)
@@ -31,11 +31,11 @@ def rows_of_sequences(table: Table) -> Part:
             table.recording = table.frame[row_names].to_numpy(object)
         elif "subject" in table.roles.at and pd.Series(table.subject).is_unique:
             table.recording = table.subject
-        elif whose := _names_of_rows(table):
-            table.recording = table.frame[whose].to_numpy(object)
-            table.notes.append(f"the column {whose!r} is taken for the names of the recordings")
+        elif column := _names_of_rows(table):
+            table.recording = table.frame[column].to_numpy(object)
+            table.notes.append(f"the column {column!r} is taken for the names of the recordings")
         else:
-            table.recording = np.array([str(i + 1) for i in range(table.size)], dtype=object)
+            table.recording = np.arange(1, table.size + 1).astype(str).astype(object)
     if empty:
         table.notes.append(f"{empty:,} rows have no behaviour (first in {table.place(int((reach == 0).argmax()))})")
         table.empty = [str(name) for name in table.recording[reach == 0]]
@@ -44,31 +44,29 @@ def rows_of_sequences(table: Table) -> Part:
     flat = labels[taken]
     table.unit = table.unit or "steps"
     if (flat == "").any():
-        table.notes.append(
-            f"{int((flat == '').sum()):,} cells within sequences have no label: another fragment begins after each"
-        )
+        what = "cells within sequences have no label: another fragment begins after each"
+        table.notes.append(f"{(flat == '').sum():,} {what}")
     part = table.part(rows.astype(np.int64), flat, steps.astype(np.float64), steps + 1.0)
-    again = (part.events["behaviour"].to_numpy()[1:] == part.events["behaviour"].to_numpy()[:-1]) & (
-        np.diff(part.fragment) == 0
-    )
-    if len(again) and again.mean() > MIN_REPEATS:
+    behaviour = part.events["behaviour"].to_numpy(object)
+    repeats = (behaviour[1:] == behaviour[:-1]) & (np.diff(part.fragment) == 0)
+    if len(repeats) and repeats.mean() > MIN_REPEATS:
         part.first_notes.append(
-            f"{again.mean():.0%} of the cells repeat the one before: --merge_repeats true makes each run one bout"
+            f"{repeats.mean():.0%} of the cells repeat the one before: --merge_repeats true makes each run one bout"
         )
     return part
 
 
-def _fewest_pieces(texts: Any, separators: list[str]) -> str:
+def _best_separator(texts: Any, separators: list[str]) -> str:
     """Return the separator by which texts have the fewest different pieces, such as the space in "self-groom rear"."""
     pieces = {one: len({word.strip() for text in texts for word in text.split(one)}) for one in separators}
     return min(separators, key=lambda one: pieces[one], default="")
 
 
 def _names_of_rows(table: Table) -> str | None:
-    """Return the first column that is not used and holds a name of its own in each row, if there is one."""
+    """Return the first unused column with a different name in each row; None for none."""
     used = table.roles.used()
-    texts = (name for name in table.frame if name not in used and table.frame[name].is_unique)
-    return next((str(name) for name in texts if not table.frame[name].str.fullmatch(r"[-\d.,]*").any()), None)
+    columns = (name for name in table.frame if name not in used and table.frame[name].is_unique)
+    return next((str(name) for name in columns if not table.frame[name].str.fullmatch(r"[-\d.,]*").any()), None)
 
 
 def strings_of_sequences(table: Table) -> Part | None:
@@ -83,30 +81,32 @@ def strings_of_sequences(table: Table) -> Part | None:
     filled = filled.str.replace(r"([^\s/()-]+)/(\d+(?:\.\d+)?)(?=-|$)", r"(\1,\2)", regex=True)
     cells = cells.where(cells == "", filled.reindex(cells.index))
     timed = filled.str.fullmatch(r"\(?[^(),]+,\s*\d+(\.\d+)?\)?(\s*-\s*\(?[^(),]+,\s*\d+(\.\d+)?\)?)*")
-    own = plain(names[0]) in ("sequence", "seq", "sequences") or not table.sheet.header
+    is_sequence = plain(names[0]) in ("sequence", "seq", "sequences") or not table.sheet.header
     separator = ""
-    if not (timed.mean() > 0.9):
+    if timed.mean() <= 0.9:
         keys = pd.Series(list(zip(table.recording, table.subject, strict=True)))
-        alone = own or ("subject" in table.roles.at and keys.is_unique)
-        counts = {one: float(filled.str.contains(one, regex=False).mean()) for one in SPLITS}
-        separator = max(SPLITS, key=lambda one: counts[one])
-        separator = _fewest_pieces(filled, [one for one in SPLITS if counts[one] >= MIN_SPLIT]) or separator
-        if not alone or counts[separator] < MIN_SPLIT:
+        alone = is_sequence or ("subject" in table.roles.at and keys.is_unique)
+        counts = {one: float(filled.str.contains(one, regex=False).mean()) for one in SEPARATORS}
+        separator = max(SEPARATORS, key=lambda one: counts[one])
+        separator = _best_separator(filled, [one for one in SEPARATORS if counts[one] >= MIN_SEPARATED]) or separator
+        if not alone or counts[separator] < MIN_SEPARATED:
             return None
-        pieces = {word for text in filled for word in text.split(separator)}
-        if len(pieces) >= filled.str.count(re.escape(separator)).add(1).sum() * 0.9 and len(filled) > 1:
+        pieces = [word for text in filled for word in text.split(separator)]
+        if len(set(pieces)) >= 0.9 * len(pieces) and len(filled) > 1:
             return None
     table.unit = "steps"
     if "recording" not in table.roles.at:
         by_subject = "subject" in table.roles.at and pd.Series(table.subject).is_unique
-        table.recording = (
-            table.subject if by_subject else np.array([str(i + 1) for i in range(table.size)], dtype=object)
-        )
+        table.recording = table.subject if by_subject else np.arange(1, table.size + 1).astype(str).astype(object)
     rows: list[int] = []
     labels: list[str] = []
     lengths: list[float] = []
     for row, text in enumerate(cells):
-        pieces_of = SPS.findall(text) if not separator else [(word.strip(), "1") for word in text.split(separator)]
+        pieces_of = (
+            STATE_AND_DURATION.findall(text)
+            if not separator
+            else [(word.strip(), "1") for word in text.split(separator)]
+        )
         rows += [row] * len(pieces_of)
         labels += [word.strip() for word, _ in pieces_of]
         lengths += [float(length) for _, length in pieces_of]

@@ -28,10 +28,10 @@ NAMED_SEPARATOR = re.compile(r'"?sep=(.)"?\s*', re.IGNORECASE)
 """A first line that names the separator for spreadsheets, such as `sep=;`."""
 
 MAX_LINES_ABOVE = 100
-"""Lines at the beginning of a file among which its header is looked for."""
+"""Lines at most, from the beginning of a file, that may be its header."""
 
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".tab", ".xlsx", ".xls", ".ods", ".parquet", ".feather", ".h5", ".xes")
-"""Files of a folder that are read, also with .gz or .zip behind."""
+"""Suffixes of the files of a folder that are read; .gz or .zip may follow."""
 
 HEADER_LINES = re.compile(r"number of header lines:?", re.IGNORECASE)
 NUMBER = re.compile(r"\s*[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?\s*")
@@ -45,10 +45,10 @@ class Sheet:
     Attributes:
         name: of the file, and of the sheet in it; for messages.
         stem: what the recording is called where no column says it.
-        frame: a pandas frame of texts without space at their ends, "" where a cell is empty; the columns have
-        different names. lines: int `[rows]`, the number of each row in the file.
+        frame: a pandas frame of texts without space at their ends, "" where one is empty; no two columns share a name.
+        lines: int `[rows]`, the number of each row in the file.
         header: whether the file names its columns; else they are numbered from 1.
-        above: what stands above the header as "name, value" lines, by name.
+        above: values of the "name, value" lines above the header, by name.
         separator: between cells; "" where the file is no text.
         notes: what a user should know of how it was read.
         is_file: whether rows are numbered as lines of a file.
@@ -69,30 +69,26 @@ class Sheet:
         return f"{self.name}, {'line' if self.is_file else 'row'} {self.lines[row]}"
 
 
-def find_files(paths: Any) -> list[Path]:
-    """Return the files that paths, folders and globs stand for, in order.
+def find_files(path: str | os.PathLike[str]) -> list[Path]:
+    """Return the files of a path, a folder or a glob, in order.
 
     Raises:
-        FileNotFoundError: nothing is there.
+        FileNotFoundError: there is no such file.
         ReadingError: a folder without tables.
     """
-    found: list[Path] = []
-    for one in [paths] if isinstance(paths, str | os.PathLike) else paths:
-        path = Path(one)
-        if path.is_dir():
-            inside = sorted(file for file in path.rglob("*") if _is_table(file))
-            if not inside:
-                raise ReadingError(f"{path}: the folder must hold tables ({', '.join(TABLE_SUFFIXES)}), got none")
-            found += inside
-        elif path.exists() or not glob.has_magic(str(path)):
-            path.stat()
-            found.append(path)
-        else:
-            matches = sorted(map(Path, glob.glob(str(path), recursive=True)))
-            if not matches:
-                raise FileNotFoundError(2, "No such file or directory", str(path))
-            found += [file for file in matches if file.is_file()]
-    return list(dict.fromkeys(found))
+    path = Path(path)
+    if path.is_dir():
+        files = sorted(file for file in path.rglob("*") if _is_table(file))
+        if not files:
+            raise ReadingError(f"{path}: the folder must hold tables ({', '.join(TABLE_SUFFIXES)}), got none")
+        return files
+    if path.exists() or not glob.has_magic(str(path)):
+        path.stat()
+        return [path]
+    matches = sorted(set(map(Path, glob.glob(str(path), recursive=True))))
+    if not matches:
+        raise FileNotFoundError(2, "No such file or directory", str(path))
+    return [file for file in matches if file.is_file()]
 
 
 def _is_table(file: Path) -> bool:
@@ -105,7 +101,7 @@ def read_sheets(path: Path, wanted: Sequence[str]) -> list[Sheet]:
 
     Args:
         path: the file.
-        wanted: names of columns that the user gave, by which the header is found.
+        wanted: names of columns that the user gave; they tell the header.
 
     Raises:
         ReadingError: an empty file, or one that is no table.
@@ -143,6 +139,7 @@ def _sheets_of_bytes(content: bytes, name: str, label: str, wanted: Sequence[str
 
 
 def _with_extra(label: str, read: Any, source: Any, **options: Any) -> Any:
+    """Return what a reader of pandas returns that may need an extra, with errors of one line."""
     try:
         return read(source, **options)
     except ImportError as error:
@@ -176,19 +173,12 @@ def _sheets_of_workbook(content: bytes, label: str, stem: str, wanted: Sequence[
         raise ReadingError(f"{label}: the workbook must hold a table, got empty sheets")
     for name, page in filled.items():
         cells = pd.DataFrame({i: _texts(page.iloc[:, i]) for i in range(page.shape[1])})
-        one = len(filled) == 1
-        yield _sheet_of_cells(
-            cells,
-            np.arange(1, len(cells) + 1),
-            label if one else f"{label}, sheet {name!r}",
-            stem if one else str(name),
-            "",
-            wanted,
-        )
+        called, page_stem = (label, stem) if len(filled) == 1 else (f"{label}, sheet {name!r}", str(name))
+        yield _sheet_of_cells(cells, np.arange(1, len(cells) + 1), called, page_stem, "", wanted)
 
 
 def _sheet_of_xes(content: bytes, label: str, stem: str) -> Sheet:
-    """Return an event log in XML as a table: a row an event, attributes of its case as `case:...`."""
+    """Return an event log in XML as a table: one row an event, with the attributes of its case as `case:...`."""
     try:
         root = ElementTree.fromstring(content)
     except ElementTree.ParseError as error:
@@ -208,7 +198,7 @@ def sheet_of_frame(frame: pd.DataFrame, name: str = "table", stem: str = "table"
     """Return a pandas frame as a sheet; an index with names becomes columns.
 
     Raises:
-        ReadingError: it is no frame.
+        ReadingError: a file that holds no frame.
     """
     if not isinstance(frame, pd.DataFrame):
         raise ReadingError(f"`paths` must be files or pandas frames, got {type(frame).__name__}")
@@ -224,7 +214,7 @@ def sheet_of_frame(frame: pd.DataFrame, name: str = "table", stem: str = "table"
 
 
 def _texts(column: "pd.Series[Any]") -> "pd.Series[Any]":
-    """Return the cells as texts without space at their ends; nothing is ""."""
+    """Return the cells as texts without space at their ends, "" for an empty cell."""
     codes, values = pd.factorize(column.astype(object))
     texts = np.array([*map(_cell, values), ""], dtype=object)
     return pd.Series(texts[codes], dtype=object)
@@ -245,7 +235,7 @@ def _cell(value: Any) -> str:
 
 
 def _sheet_of_text(content: bytes, label: str, stem: str, wanted: Sequence[str]) -> Sheet:
-    text, note = _decoded(content, label)
+    text, notes = _decode(content, label)
     lines = text.split("\n")
     if first_line := re.fullmatch(r"FirstLineOfData=(\d+)", lines[0].strip()):
         return _sheet_of_jwatcher(lines, int(first_line[1]), label, stem)
@@ -262,21 +252,21 @@ def _sheet_of_text(content: bytes, label: str, stem: str, wanted: Sequence[str])
             io.StringIO(text), sep=separator, skiprows=skipped, skip_blank_lines=False, index_col=False, **options
         )
     except (pd.errors.ParserError, pd.errors.EmptyDataError) as error:
-        what = "a quote that is not closed" if "inside string" in str(error) else f"text that is none ({error})"
+        what = "a quote that is not closed" if "inside string" in str(error) else f"another text ({error})"
         raise ReadingError(f"{label}: the file must be a table, got {what}") from None
     for column in cells:
-        cells[column] = _stripped(cells[column])
+        cells[column] = _strip(cells[column])
     numbers = np.arange(len(cells)) + 1 + skipped
     if '"' in text:  # a quoted cell may go over several lines
         inside = sum(cells[column].str.count("\n").to_numpy(np.int64, na_value=0) for column in cells)
         numbers = numbers + np.cumsum(inside) - inside if np.any(inside) else numbers
     sheet = _sheet_of_cells(cells, numbers, label, stem, separator, wanted)
-    sheet.notes += [note] if note else []
+    sheet.notes += notes
     return sheet
 
 
 def _sheet_of_jwatcher(lines: list[str], first: int, label: str, stem: str) -> Sheet:
-    """Return a focal data file of JWatcher: milliseconds and the key that was pressed; EOF is the end."""
+    """Return a focal data file of JWatcher: milliseconds and the key that was pressed; EOF ends it."""
     pairs = [
         (number, _cells_of_line(line, ",")) for number, line in enumerate(lines[first - 1 :], first) if line.strip()
     ]
@@ -286,15 +276,15 @@ def _sheet_of_jwatcher(lines: list[str], first: int, label: str, stem: str) -> S
     return Sheet(label, stem, frame, np.array([number for number, _ in rows], np.int64), notes=notes)
 
 
-def _stripped(column: "pd.Series[Any]") -> "pd.Series[Any]":
+def _strip(column: "pd.Series[Any]") -> "pd.Series[Any]":
     codes, values = pd.factorize(column)
     return pd.Series(np.array([str(value).strip() for value in values], dtype=object)[codes], dtype=object)
 
 
-def _decoded(content: bytes, label: str) -> tuple[str, str]:
-    """Return the text of a file, and a note where its encoding was guessed."""
+def _decode(content: bytes, label: str) -> tuple[str, list[str]]:
+    """Return the text of a file, and a note if its encoding was guessed."""
     head = content[:200]
-    note = ""
+    notes: list[str] = []
     if content[:4] in (b"\xff\xfe\x00\x00", b"\x00\x00\xfe\xff"):
         encoding = "utf-32"
     elif content[:2] in (b"\xff\xfe", b"\xfe\xff"):
@@ -312,10 +302,10 @@ def _decoded(content: bytes, label: str) -> tuple[str, str]:
         if encoding != "utf-8-sig":
             raise ReadingError(f"{label}: the file must be whole {encoding.upper()}, got one that is cut off") from None
         text = content.decode("cp1252", errors="replace")
-        note = f"{label} is not UTF-8, and read as Windows-1252 (Western European)"
+        notes = [f"{label} is not UTF-8, and is read as Windows-1252 (Western European)"]
     if "\0" in text:
         raise ReadingError(f"{label}: the file must be a table of text, got binary data")
-    return text.replace("\r\n", "\n").replace("\r", "\n").rstrip("\n"), note
+    return text.replace("\r\n", "\n").replace("\r", "\n").rstrip("\n"), notes
 
 
 def _cells_of_line(line: str, separator: str) -> list[str]:
@@ -326,18 +316,18 @@ def _cells_of_line(line: str, separator: str) -> list[str]:
 
 
 def _separator(lines: Sequence[str], wanted: Sequence[str]) -> str:
-    """Return the separator by which the lines have most cells, as many in each.
+    """Return the separator by which the lines have most cells, equally many in each.
 
-    Names of columns that are known, or that the user gave, count first.
+    What counts first is the number of usual or wanted names in one line.
     """
     lines = [line for line in lines if line.strip()]
-    known = KNOWN_NAMES | {plain(name) for name in wanted}
+    names = KNOWN_NAMES | {plain(name) for name in wanted}
     best, best_rank = ",", (-1.0, -1.0)
     for separator in (*SEPARATORS, " "):
         rows = [_cells_of_line(line, separator) if separator != " " else line.split() for line in lines]
         sizes = Counter(map(len, rows))
         width, times = max(sizes.items(), key=lambda item: (item[1] * (item[0] > 1), item[0]))
-        named = max(sum(plain(cell) in known for cell in row) if len(row) > 1 else 0 for row in rows)
+        named = max(sum(plain(cell) in names for cell in row) if len(row) > 1 else 0 for row in rows)
         regular = times / len(rows) if width > 1 else 0.0
         if separator == " " and (regular < 1 or best_rank > (0, 0.5)):
             continue
@@ -352,22 +342,18 @@ def _separator(lines: Sequence[str], wanted: Sequence[str]) -> str:
 def _sheet_of_cells(
     cells: Any, lines: NDArray[Any], name: str, stem: str, separator: str, wanted: Sequence[str]
 ) -> Sheet:
-    """Return a sheet of rows of cells, with the header found and what stands above it taken out."""
+    """Return a sheet of rows of cells, with its header and without the lines above it."""
     filled = cells.ne("").any(axis=1).to_numpy()
-    cells, lines = cells[filled].reset_index(drop=True), np.asarray(lines)[filled]
-    cells = cells.loc[:, cells.ne("").any(axis=0)]
-    cells.columns = pd.RangeIndex(cells.shape[1])
+    cells, lines = _without_empty_columns(cells[filled]), np.asarray(lines)[filled]
     comment = cells[0].str.startswith("\\").to_numpy()  # the frequencies of Audacity's labels
     if comment.any() and not comment.all():
         cells, lines = cells[~comment].reset_index(drop=True), lines[~comment]
     remark = cells[0].str.startswith("#").to_numpy()
-    above = int(np.argmin(remark)) if remark.any() and not remark.all() else 0
-    if above and not (
-        above == 1 and cells.iloc[0].ne("").sum() > 1 and cells.iloc[0].ne("").sum() == cells.iloc[1].ne("").sum()
-    ):
-        cells, lines = cells.iloc[above:].reset_index(drop=True), lines[above:]
-        cells = cells.loc[:, cells.ne("").any(axis=0)]
-        cells.columns = pd.RangeIndex(cells.shape[1])
+    remarks = int(np.argmin(remark)) if remark.any() and not remark.all() else 0
+    sizes = cells.iloc[:2].ne("").sum(axis=1).tolist()
+    is_header = remarks == 1 and sizes[0] > 1 and sizes[0] == sizes[1]  # such as "#,animal,behaviour"
+    if remarks and not is_header:
+        cells, lines = _without_empty_columns(cells.iloc[remarks:]), lines[remarks:]
     sheet = Sheet(name, stem, cells, lines, separator=separator)
     top = cells.head(MAX_LINES_ABOVE).to_numpy(dtype=object).tolist()
     at, header = _find_header(top, cells, wanted)
@@ -390,10 +376,10 @@ def _sheet_of_cells(
         else:
             rows = np.flatnonzero(surplus.ne("").any(axis=1).to_numpy())
             if len(rows) < 0.5 * len(body):
-                row = lines[at + 1 :][rows[0]]
-                cells_of_row = width + int((surplus.iloc[rows[0]] != "").to_numpy().nonzero()[0].max()) + 1
+                line = lines[at + 1 :][rows[0]]
+                size = width + int((surplus.iloc[rows[0]] != "").to_numpy().nonzero()[0].max()) + 1
                 raise ReadingError(
-                    f"{name}, line {row}: a row must have {width} cells, as many as the header, got {cells_of_row}"
+                    f"{name}, line {line}: a row must have {width} cells, as many as the header, got {size}"
                     f" ({len(rows):,} such rows); quote cells that hold {separator!r}"
                 )
     sheet.frame = body.set_axis(_distinct([*header, *[""] * (body.shape[1] - len(header))][: body.shape[1]]), axis=1)
@@ -401,23 +387,28 @@ def _sheet_of_cells(
     return sheet
 
 
+def _without_empty_columns(cells: Any) -> Any:
+    cells = cells.loc[:, cells.ne("").any(axis=0)].reset_index(drop=True)
+    return cells.set_axis(pd.RangeIndex(cells.shape[1]), axis=1)
+
+
 def _distinct(names: Iterable[str]) -> list[str]:
-    """Return names of columns that differ: empty ones by their position, repeated ones by a number behind."""
-    found: list[str] = []
+    """Return names of columns that differ: empty ones become their position, repeated ones get a number."""
+    distinct: list[str] = []
     for i, name in enumerate(names):
         name = name or f"(column {i + 1})"
         new, number = name, 2
-        while new in found:
+        while new in distinct:
             new, number = f"{name} ({number})", number + 1
-        found.append(new)
-    return found
+        distinct.append(new)
+    return distinct
 
 
 def _find_header(top: list[list[str]], cells: Any, wanted: Sequence[str]) -> tuple[int, list[str] | None]:
     """Return the position of the header and its cells; None for the cells where the file has none.
 
-    The line with most of the names that the user gave; else that of a program that is known; else the line that the
-    file itself names; else the first line that is as wide as the table, if it is unlike the rows below it.
+    The header is the line with most of the wanted names; else the line that the file itself says; else a known
+    program's; else the first line that is as wide as the table, if it is unlike the rows below it.
     """
     plains = [[plain(cell) for cell in row] for row in top]
     if wanted:
@@ -428,7 +419,7 @@ def _find_header(top: list[list[str]], cells: Any, wanted: Sequence[str]) -> tup
             return at, top[at]
     for row in top[:MAX_LINES_ABOVE]:
         if HEADER_LINES.fullmatch(row[0]) and len(row) > 1 and row[1].isdecimal():
-            at = _ethovision_header(top, int(row[1]))
+            at = _header_of_ethovision(top, int(row[1]))
             return at, top[at]
     for at, row in enumerate(plains):
         if any(program.needs <= set(row) for program in PROGRAMS):
@@ -452,18 +443,14 @@ def _find_header(top: list[list[str]], cells: Any, wanted: Sequence[str]) -> tup
     return (start if start < 3 else 0), None
 
 
-def _ethovision_header(top: list[list[str]], count: int) -> int:
-    """Return the header of an export of EthoVision: the last line but one of those it counts, before the units."""
-    for at in (count - 2, count - 1):
-        if 0 <= at < len(top) and any(plain(cell) in ("trial time", "recording time") for cell in top[at]):
-            return at
-    return next(
-        (i for i, row in enumerate(top) if any(plain(cell) in ("trial time", "recording time") for cell in row)), 0
-    )
+def _header_of_ethovision(top: list[list[str]], count: int) -> int:
+    """Return the position of EthoVision's header: the last line but one of those it counts, before the units."""
+    timed = [i for i, row in enumerate(top) if {"trial time", "recording time"} & set(map(plain, row))]
+    return next((at for at in (count - 2, count - 1, *timed) if at in timed), 0)
 
 
 def _is_header(row: list[str], cells: Any, at: int) -> bool:
-    """Whether a line names columns: by words that are known, by its numbers, or since it is unlike the rows below."""
+    """Return whether a line names columns: by usual names, by its numbers, or since it is unlike the rows below."""
     words = [cell for cell in row if cell]
     if not words:
         return False
@@ -471,17 +458,15 @@ def _is_header(row: list[str], cells: Any, at: int) -> bool:
         return True
     if len(set(words)) < len(words):
         return False
-    if any(re.fullmatch(r"-?\d+[.,]\d+|\d+:\d\d(:\d\d.*)?", word) for word in words) and not all(
-        map(_is_number, words)
-    ):
+    all_numbers = all(map(_is_number, words))
+    if any(re.fullmatch(r"-?\d+[.,]\d+|\d+:\d\d(:\d\d.*)?", word) for word in words) and not all_numbers:
         return False  # a time among words is data
     below = cells.iloc[at + 1 :]
     if not len(below):
         return not any(map(_is_number, words))
-    if all(map(_is_number, words)):
-        numbers = [float(word.replace(",", ".")) for word in words]
-        counts = len(numbers) > 2 and all(b - a == 1 for a, b in pairwise(numbers))
-        return counts and not _counts(below.iloc[0]) and (not row[0] or numbers[0] in (0, 1) or len(numbers) > 5)
+    if all_numbers:
+        likely = not row[0] or float(words[0].replace(",", ".")) in (0, 1) or len(words) > 5
+        return len(words) > 2 and _count_up(words) and not _count_up(below.iloc[0]) and likely
     numbered = [STEM_AND_NUMBER.fullmatch(word) for word in words]
     stems = Counter(match[1] for match in numbered if match)
     if stems and max(stems.values()) > max(2, len(words) // 2):
@@ -495,7 +480,8 @@ def _is_header(row: list[str], cells: Any, at: int) -> bool:
     return not values & set(words) and len(values) < max(3, len(below)) * below.shape[1]
 
 
-def _counts(row: "pd.Series[Any]") -> bool:
+def _count_up(row: Iterable[str]) -> bool:
+    """Return whether the filled cells of a row are numbers that count up by one."""
     words = [cell for cell in row if cell]
     if not words or not all(map(_is_number, words)):
         return False

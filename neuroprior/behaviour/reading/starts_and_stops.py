@@ -7,16 +7,15 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from neuroprior.behaviour.reading.names import WORDS, plain
-from neuroprior.behaviour.reading.table import MAX_OVERLAP, Floats, Integers, Part, Table, overlaps
+from neuroprior.behaviour.reading.table import MAX_OVERLAP, Floats, Integers, Part, Table, overlapping
 from neuroprior.behaviour.reading.times import CLOCKS, over_midnight
 
 
 def rows_of_starts_and_stops(table: Table) -> Part:
-    """Read starts and stops that are rows of their own, and points; see `WORDS`."""
+    """Read starts, stops and points, each in a row of its own; `WORDS` tells them apart."""
     if "start" not in table.roles.at:
-        table.problems.add(
-            "`columns.start` must name the time of each row where starts and stops are rows", [0], table.place
-        )
+        what = "`columns.start` must name the column of times, since rows are starts and stops"
+        table.problems.add(what, [0], table.place)
         table.problems.stop()
     times = table.times("start")
     assert times is not None
@@ -31,12 +30,12 @@ def rows_of_starts_and_stops(table: Table) -> Part:
     if untimed.size:
         table.problems.add("`start` must be known, got an empty cell", untimed.tolist(), table.place)
         table.problems.stop()
-    modifiers = [name for name in table.frame if plain(name).startswith("modifier") and name not in table.roles.used()]
+    used = table.roles.used()
+    modifiers = [name for name in table.frame if plain(name).startswith("modifier") and name not in used]
     pairs = _pair(table.unit_codes(), texts, when, kinds)
-    if (
-        pairs.unpaired.size
-        or overlaps(table.unit_codes()[kinds == 0], when[kinds == 0], pairs.stop[kinds == 0]) > MAX_OVERLAP
-    ):
+    is_start = kinds == 0
+    overlaps = overlapping(table.unit_codes()[is_start], when[is_start], pairs.stop[is_start])
+    if pairs.unpaired.size or len(overlaps) > MAX_OVERLAP * is_start.sum():
         table.split_sessions(when, texts)
         pairs = _pair(table.unit_codes(), texts, when, kinds)
     if modifiers and pairs.unpaired.size:
@@ -45,9 +44,8 @@ def rows_of_starts_and_stops(table: Table) -> Part:
         if with_modifiers.unpaired.size < pairs.unpaired.size:
             pairs = with_modifiers
             table.notes.append(f"starts and stops are paired by {', '.join(modifiers)} as well")
-    durations = table.times("duration")
     stop = pairs.stop
-    if durations is not None:
+    if (durations := table.times("duration")) is not None:
         fill = np.isnan(stop) & np.isfinite(durations.values) & (durations.values > 0) & (kinds == 0)
         stop = np.where(fill, when + durations.values, stop)
         pairs = pairs._replace(unpaired=pairs.unpaired[~fill[pairs.unpaired]])
@@ -57,16 +55,12 @@ def rows_of_starts_and_stops(table: Table) -> Part:
         way = "--unpaired drop leaves such rows out, --unpaired open keeps starts whose stop is not known"
         table.problems.add(f"{texts[row]!r} has {what}; {way}", pairs.unpaired.tolist(), table.place)
     elif pairs.unpaired.size:
-        done = (
-            "left out"
-            if table.options.unpaired == "drop"
-            else "starts without a stop kept, stops without a start left out"
-        )
+        drop = table.options.unpaired == "drop"
+        done = "left out" if drop else "starts without a stop kept, stops without a start left out"
         table.first_notes.append(f"{pairs.unpaired.size:,} rows are starts or stops without the other: {done}")
-    keep = kinds != 1
+    keep = (kinds == 0) | (kinds == 2)
     if table.options.unpaired == "drop":
         keep[pairs.unpaired] = False
-    keep &= kinds >= 0
     rows = np.flatnonzero(keep)
     labels = table.labels(texts)
     return table.part(rows, labels[rows], when[rows], stop[rows])
@@ -76,22 +70,22 @@ def _kinds_of_rows(table: Table) -> Integers:
     """Return 0 for starts, 1 for stops, 2 for points, -1 for rows that are none."""
     column = table.frame[table.roles.at["event_type"][0]]
     numbers = {"start": 0, "stop": 1, "point": 2}
-    known = {word: numbers[kind] for kind, words in WORDS.items() for word in words}
-    known |= {word.lower(): numbers[kind] for word, kind in table.options.words.items()}
+    kind_of = {word: numbers[kind] for kind, words in WORDS.items() for word in words}
+    kind_of |= {word.lower(): numbers[kind] for word, kind in table.options.words.items()}
     codes, values = pd.factorize(column)
     words = [str(value).lower() for value in values]
     if set(words) <= {"0", "1"} and not set(words) & set(table.options.words):
-        known |= {"1": 0, "0": 1}
-    kinds = np.array([known.get(word, -1) for word in words], np.int64)[codes]
+        kind_of |= {"1": 0, "0": 1}
+    kinds = np.array([kind_of.get(word, -1) for word in words], np.int64)[codes]
     lifecycle = table.roles.program is not None and table.roles.program.name.startswith("XES")
     wrong = np.flatnonzero(kinds < 0)
     if wrong.size and lifecycle:
-        left = sorted({str(column.iloc[row]) for row in wrong})
-        table.notes.append(f"{wrong.size:,} rows are neither starts nor completions ({', '.join(left)}), and left out")
+        others = ", ".join(sorted({str(column.iloc[row]) for row in wrong}))
+        table.notes.append(f"{wrong.size:,} rows are neither starts nor completions ({others}), and are left out")
     elif wrong.size:
-        given = column.iloc[int(wrong[0])]
-        what = f"`event_type` must be a word for a start, a stop or a point, got {given!r}"
-        table.problems.add(f"{what}; say what it means (--words {given or 'WORD'}=start)", wrong.tolist(), table.place)
+        word = column.iloc[int(wrong[0])]
+        what = f"`event_type` must be a word for a start, a stop or a point, got {word!r}"
+        table.problems.add(f"{what}; say what it means (--words {word or 'WORD'}=start)", wrong.tolist(), table.place)
         table.problems.stop()
     if lifecycle:
         kinds = _instants(table, kinds)
@@ -99,7 +93,7 @@ def _kinds_of_rows(table: Table) -> Integers:
 
 
 def _instants(table: Table, kinds: Integers) -> Integers:
-    """Return the kinds with completions without a start as points, as in event logs."""
+    """Return the kinds of rows, with completions that have no start as points."""
     times = table.times("start")
     assert times is not None
     pairs = _pair(table.unit_codes(), table.joined(table.roles.at["behaviour"]), times.values, kinds)
@@ -124,7 +118,10 @@ class Pairs(NamedTuple):
 
 
 def _pair(unit: Integers, labels: NDArray[Any], when: Floats, kinds: Integers) -> Pairs:
-    """Pair each start with the next stop of the same label; at equal times a stop closes the earlier start."""
+    """Pair each start with the next stop of the same label; at equal times a stop closes the earlier start.
+
+    All are `[rows]`: the number of the recording and subject, the label, the time, and the kind (`_kinds_of_rows`).
+    """
     label = pd.factorize(labels)[0].astype(np.int64)
     key = unit * (int(label.max(initial=0)) + 1) + label
     rows = np.flatnonzero((kinds == 0) | (kinds == 1))

@@ -1,4 +1,4 @@
-"""A sheet whose columns are known, and the events that are read from it: what all layouts share."""
+"""A sheet with the roles of its columns, and the events read from it: what all layouts share."""
 
 import re
 from dataclasses import dataclass, field, replace
@@ -13,7 +13,7 @@ from neuroprior.behaviour.reading.names import NO_SUBJECT, TOTALS, plain
 from neuroprior.behaviour.reading.options import Options
 from neuroprior.behaviour.reading.problems import Problems
 from neuroprior.behaviour.reading.sheets import Sheet
-from neuroprior.behaviour.reading.times import CLOCKS, DATES, NUMBERS, Times, read_times
+from neuroprior.behaviour.reading.times import NUMBERS, Times, read_times
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -22,16 +22,16 @@ JOIN = "|"
 """Between the labels of several columns."""
 
 SECONDS = {"s": 1.0, "ms": 0.001}
-"""Units of time that can be converted."""
+"""Seconds of the units of time that can be converted."""
 
-UNIT = re.compile(r"\(?(s|ms|sec|seconds|min|frames|h|)\)?", re.IGNORECASE)
-"""A unit of time in a row below the header."""
+UNIT_CELL = re.compile(r"\(?(s|ms|sec|seconds|min|frames|h|)\)?", re.IGNORECASE)
+"""A cell of a row of units below the header."""
 
 MIN_REPEATS = 0.3
-"""Share of rows with the label of the row before, at least which rows at equal steps are frames."""
+"""Share of rows that repeat the label of the row before, above which rows at equal steps are frames."""
 
 MAX_OVERLAP = 0.05
-"""Share of bouts that overlap a bout of the same behaviour, above which something is wrong."""
+"""Share of bouts at most that may overlap an earlier one of the same behaviour."""
 
 
 @dataclass
@@ -65,13 +65,13 @@ class Part:
 
 
 class Table:
-    """A sheet whose columns are known, and what its layouts share.
+    """A sheet with the roles of its columns, and what its layouts share.
 
     Args:
         sheet: the sheet.
         roles: what its columns hold.
         options: how it is read.
-        problems: gets what is wrong.
+        problems: receives what is wrong.
     """
 
     def __init__(self, sheet: Sheet, roles: Roles, options: Options, problems: Problems) -> None:
@@ -87,14 +87,13 @@ class Table:
         self.recording = self._keys("recording", self._name_of_file())
         self.subject = self._subjects()
         self.observer = self._keys("observer", "")
-        self.has_time = bool(self.roles.at.get("start"))
 
     def place(self, row: int) -> str:
         """Return where a row stands."""
         return self.sheet.place(row)
 
     def _drop_rows(self) -> None:
-        """Leave out a row of units below the header, totals, and rows that a program writes twice."""
+        """Leave out a row of units below the header, rows without content, and rows that a program writes twice."""
         sheet, at = self.sheet, self.roles.at
         if not len(sheet.frame):
             return
@@ -103,24 +102,21 @@ class Table:
         label = [name for name in at.get("behaviour", []) if self.roles.layout != "rows of sequences"]
         first = sheet.frame.iloc[0]
         units = [first[name] for name in timed]
-        if any(units) and all(map(UNIT.fullmatch, units)):
+        if any(units) and all(map(UNIT_CELL.fullmatch, units)):
             keep[0] = False
             self.notes.append(f"line {sheet.lines[0]} holds units, and is not read as a row")
             self.unit = self.unit or units[0].strip("()").lower().removesuffix("ec").removesuffix("econds")
         if label and self.roles.layout == "events":
-            nothing = sheet.frame[label + timed].eq("").all(axis=1).to_numpy()
-            whose = [name for use in ("recording", "subject") for name in at.get(use, [])]
             unowned = np.zeros(len(keep), bool)
-            for name in whose:
+            for name in [name for use in ("recording", "subject") for name in at.get(use, [])]:
                 empty = sheet.frame[name].eq("").to_numpy()
                 unowned |= empty & (not empty.all())
-            loose = nothing & (unowned if whose else np.zeros(len(keep), bool)) & keep
+            loose = sheet.frame[label + timed].eq("").all(axis=1).to_numpy() & unowned & keep
             if loose.any():
                 keep &= ~loose
-                row = int(loose.argmax())
-                self.notes.append(
-                    f"{loose.sum():,} rows without behaviour, time and owner are left out ({sheet.place(row)})"
-                )
+                first_loose = sheet.place(int(loose.argmax()))
+                what = "rows without behaviour and time, and without recording or subject, are left out"
+                self.notes.append(f"{loose.sum():,} {what} (first in {first_loose})")
         if len(label) == 1 and len(sheet.frame) > 1:
             total = sheet.frame[label[0]].str.lower().isin(TOTALS).to_numpy()
             below = np.logical_and.accumulate(total[::-1])[::-1]  # from the first of those at the end on
@@ -143,20 +139,21 @@ class Table:
         texts = [self.frame[name].to_numpy(object) for name in names]
         if len(texts) == 1:
             return np.asarray(texts[0], dtype=object)
-        codes = [pd.factorize(one) for one in texts]
         key = np.zeros(self.size, np.int64)
-        for numbers, values in codes:
-            key = key * (len(values) + 1) + numbers
-        kinds, first, inverse = np.unique(key, return_index=True, return_inverse=True)
+        for codes, values in map(pd.factorize, texts):
+            key = key * (len(values) + 1) + codes
+        _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
         labels = [JOIN.join(str(one[i]) for one in texts if one[i]) for i in first]
-        return np.array([*labels, ""], dtype=object)[inverse] if len(kinds) else np.array([], dtype=object)
+        return np.array([*labels, ""], dtype=object)[inverse]
 
     def _name_of_file(self) -> str:
+        name = self._above("observation id", "trial name", "observation", "video")
+        return re.sub(r"\s+", " ", name) or self.sheet.stem
+
+    def _above(self, *keys: str) -> str:
+        """Return what stands above the header by the first of some names; "" for none."""
         above = {plain(name): value for name, value in self.sheet.above.items()}
-        named = next(
-            (above[key] for key in ("observation id", "trial name", "observation", "video") if above.get(key)), ""
-        )
-        return re.sub(r"\s+", " ", named) or self.sheet.stem
+        return next((above[key] for key in keys if above.get(key)), "")
 
     def _keys(self, use: str, default: str) -> NDArray[Any]:
         names = self.roles.at.get(use)
@@ -165,29 +162,22 @@ class Table:
         keys = _whole_numbers(self.joined(names))
         empty = keys == ""
         if use == "recording" and empty.any() and not empty.all():
-            rows = np.flatnonzero(empty)
-            self.notes.append(
-                f"{rows.size:,} rows have no recording ({self.place(int(rows[0]))}); they are called {default!r}"
-            )
+            where = self.place(int(empty.argmax()))
+            self.notes.append(f"{empty.sum():,} rows have no recording (first in {where}), and are called {default!r}")
         return np.where(empty, default, keys)
 
     def _subjects(self) -> NDArray[Any]:
         names = self.roles.at.get("subject")
         if not names:
-            above = {plain(name): value for name, value in self.sheet.above.items()}
-            owner = next((above[key] for key in ("subject name", "animal id", "subject") if above.get(key)), "")
-            return np.full(self.size, owner, dtype=object) if owner else np.full(self.size, "", dtype=object)
+            return np.full(self.size, self._above("subject name", "animal id", "subject"), dtype=object)
         keys = _whole_numbers(self.joined(names))
-        codes, values = pd.factorize(keys)
-        nobody = np.array([str(one).lower() in NO_SUBJECT for one in values] or [False])
+        nobody = pd.Series(keys, dtype=object).str.lower().isin(NO_SUBJECT).to_numpy()
         if nobody.any():
-            self.notes.append(
-                f"{int(nobody[codes].sum()):,} rows are of {values[nobody.argmax()]!r}, taken as a subject"
-            )
+            self.notes.append(f"{nobody.sum():,} rows are of {keys[nobody.argmax()]!r}, taken as a subject")
         return keys
 
     def labels(self, texts: NDArray[Any]) -> NDArray[Any]:
-        """Return labels as the user wants them: "" where one is missing, renamed, and without those to drop."""
+        """Return labels as the options say: renamed, "" where one is missing."""
         codes, values = pd.factorize(texts)
         labels = [self.options.label(str(value)) for value in values]
         self.renamed |= {str(value) for value in values} & self.options.rename.keys()
@@ -196,19 +186,18 @@ class Table:
             rows = np.flatnonzero(np.array(labels, dtype=object)[codes] == "-1")
             self.first_notes.append(
                 f"the label -1 ({rows.size:,} rows, first in {self.place(int(rows[0]) % max(self.size, 1))})"
-                " stands for none, as"
-                " clusterings write it; --rename -1=noise makes it a behaviour"
+                " stands for none, as clusterings write it; --rename -1=noise makes it a behaviour"
             )
             labels = ["" if label == "-1" else label for label in labels]
-        found = np.array([*labels, ""], dtype=object)[codes]
-        if self.options.missing == "error" and (found == "").any():
-            rows = np.flatnonzero(found == "")
+        renamed = np.array([*labels, ""], dtype=object)[codes]
+        if self.options.missing == "error" and (renamed == "").any():
+            rows = np.flatnonzero(renamed == "")
             what = f"`behaviour` must be known, got {str(texts[rows[0]])!r}"
             self.problems.add(what, (rows % max(self.size, 1)).tolist(), self.place)
-        return found
+        return renamed
 
     def times(self, use: str) -> Times | None:
-        """Return the times of a use, or None; day by day on from midnight where they are times of day."""
+        """Return the times of a use (start, stop or duration); None where no column holds them."""
         names = self.roles.at.get(use)
         if not names:
             return None
@@ -216,37 +205,34 @@ class Table:
         for name in names[1:]:
             days = pd.Series(texts, dtype=object).str.replace(r"[ T]00:00(:00)?$", "", regex=True).to_numpy(object)
             texts = days + " " + self.frame[name].to_numpy(object)
-        found = read_times(
+        times = read_times(
             texts, use, self.place, self.problems, separator=self.sheet.separator, day_first=self.options.day_first
         )
-        if use != "start" and found.kind == NUMBERS:
-            return self._in_unit_of_starts(use, names[0], found)
         if use == "start":
-            if found.kind == CLOCKS or found.kind == DATES:
-                self.unit = "s"
-            else:
-                self.unit = _unit_of(names[0]) or self.unit
-        return found
+            self.unit = (_unit_of_name(names[0]) or self.unit) if times.kind == NUMBERS else "s"
+        elif times.kind == NUMBERS:
+            return self._convert_to_unit_of_starts(use, names[0], times)
+        return times
 
-    def _in_unit_of_starts(self, use: str, name: str, found: Times) -> Times | None:
+    def _convert_to_unit_of_starts(self, use: str, name: str, times: Times) -> Times | None:
         """Return times in the unit of the starts, where the names of both columns say theirs.
 
-        Frames beside seconds cannot be compared: a column that was found is left out, one that was named is an error.
+        Frames beside seconds cannot be compared: a column that no user named is left out, a named one is an error.
         """
-        start, own = self.roles.at.get("start", [""])[-1], _unit_of(name)
-        other = _unit_of(start)
-        if not own or not other or own == other:
-            return found
-        if own in SECONDS and other in SECONDS:
-            self.notes.append(f"the column {name!r} is read in {other}, as {start!r} is")
-            return found._replace(values=found.values * (SECONDS[own] / SECONDS[other]))
-        if use in self.roles.found:
-            self.notes.append(
-                f"the column {name!r} is in {own} where {start!r} is in {other}, and is not used as {use}"
-            )
+        start = self.roles.at.get("start", [""])[-1]
+        unit, start_unit = _unit_of_name(name), _unit_of_name(start)
+        if not unit or not start_unit or unit == start_unit:
+            return times
+        if unit in SECONDS and start_unit in SECONDS:
+            self.notes.append(f"the column {name!r} is read in {start_unit}, as {start!r} is")
+            return times._replace(values=times.values * (SECONDS[unit] / SECONDS[start_unit]))
+        if use in self.roles.inferred:
+            what = f"the column {name!r} is in {unit} where {start!r} is in {start_unit}"
+            self.notes.append(f"{what}, and is not used as {use}")
             del self.roles.at[use]
             return None
-        self.problems.add(f"`{use}` must be in {other}, as {start!r} is, got {name!r} in {own}", [0], self.place)
+        what = f"`{use}` must be in {start_unit}, as {start!r} is, got {name!r} in {unit}"
+        self.problems.add(what, [0], self.place)
         return None
 
     def unit_codes(self) -> Integers:
@@ -255,21 +241,20 @@ class Table:
         return pd.factorize(key)[0].astype(np.int64)
 
     def split_sessions(self, start: Floats, labels: NDArray[Any], stop: Floats | None = None) -> None:
-        """Give sessions without a name one each, where the time starts again within a recording.
+        """Make each session a recording of its own, where the time starts again within a recording.
 
-        Rows that are merely in another order than time, such as sorted by behaviour, are left as they are.
+        Rows merely in another order than time, such as sorted by behaviour, stay in their recording.
         """
         unit = self.unit_codes()
         order = np.argsort(unit, kind="stable")
         when, same = start[order], np.diff(unit[order], prepend=-1) == 0
-        known = pd.Series(when).groupby(unit[order]).ffill().to_numpy(np.float64)
+        latest = pd.Series(when).groupby(unit[order]).ffill().to_numpy(np.float64)
         back = np.zeros(len(order), bool)
-        back[1:] = same[1:] & (known[1:] < known[:-1])
+        back[1:] = same[1:] & (latest[1:] < latest[:-1])
         if not back.any():
             return
-        block_sorted = np.cumsum(back | ~same)
         block = np.empty(len(order), np.int64)
-        block[order] = block_sorted
+        block[order] = np.cumsum(back | ~same)
         frame = pd.DataFrame({"unit": unit, "block": block, "start": start, "label": labels})
         blocks = frame.groupby("block").agg(
             unit=("unit", "first"),
@@ -285,15 +270,14 @@ class Table:
         restarts = (again["low"] - again["lowest"] <= 0.5 * span) & (again["kinds"] > 1) & (again["size"] >= 3)
         if not len(again) or restarts.mean() < 0.9:
             row = int(np.flatnonzero(block == again.index[0])[0])
-            self.notes.append(f"rows are not in the order of time (first {self.place(row)}), and are put in it")
+            self.notes.append(f"rows are not in the order of time (first in {self.place(row)}), and are sorted by it")
             return
-        if stop is not None and not overlaps(unit, start, stop) > MAX_OVERLAP:
+        if stop is not None and len(overlapping(unit, start, stop)) <= MAX_OVERLAP * len(start):
             return
         chosen = set(again.index[restarts])
         rows = np.array([int(np.flatnonzero(block == one)[0]) for one in sorted(chosen)])
         if "recording" in self.roles.at:
-            what = "the time starts again within a recording"
-            what += "; say which column tells its sessions apart (--columns.recording)"
+            what = "the time starts again within a recording; name the column of its sessions (--columns.recording)"
             self.problems.add(what, rows.tolist(), self.place)
             return
         number = blocks.index.isin(chosen)
@@ -304,8 +288,7 @@ class Table:
         )
         self.first_notes.append(
             f"the time starts again {len(rows):,} times, first in {self.place(int(rows[0]))}: what follows is"
-            " read as another"
-            " recording"
+            " read as another recording"
         )
 
     def part(
@@ -315,9 +298,9 @@ class Table:
 
         Args:
             rows: int `[events]`.
-            labels: `[events]`, "" where none is known: what follows is another fragment.
-            start, stop: float64 `[events]`.
-            stretch: int `[events]`, in which stretch of its recording each is, between two gaps; None: in one.
+            labels: str `[events]`, "" where none is known: what follows is another fragment.
+            start, stop: float64 `[events]`, NaN where not known.
+            stretch: int `[events]`, the stretch of its recording, between two gaps, that each is in; None: one.
         """
         events = pd.DataFrame({
             "recording": self.recording[rows], "subject": self.subject[rows], "behaviour": labels,
@@ -355,7 +338,8 @@ def _whole_numbers(keys: NDArray[Any]) -> NDArray[Any]:
     return keys
 
 
-def _unit_of(name: str) -> str:
+def _unit_of_name(name: str) -> str:
+    """Return the unit of time that the name of a column says; "" for none."""
     low = name.lower()
     if "frame" in low or "image" in low:
         return "frames"
@@ -364,11 +348,12 @@ def _unit_of(name: str) -> str:
     return "s" if re.search(r"\b(s|sec|secs|seconds?|sf)\b", low.replace("_", " ")) else ""
 
 
-def overlaps(unit: Integers, start: Floats, stop: Floats) -> float:
-    """Return the share of bouts that begin before an earlier one of the same unit ended."""
+def overlapping(unit: Integers, start: Floats, stop: Floats) -> Integers:
+    """Return the bouts that begin before an earlier one of the same unit ended, in the order of units and starts."""
     order = np.lexsort((start, unit))
     latest = pd.Series(stop[order]).groupby(unit[order]).cummax().to_numpy()
     same = np.diff(unit[order], prepend=-1) == 0
     before = np.append(np.nan, latest[:-1])
-    size = np.abs(np.where(np.isfinite(before), before, 0)) * 1e-9 + 1e-9
-    return float((same & (start[order] < before - size)).mean()) if len(order) else 0.0
+    rounding = np.abs(before) * 1e-9 + 1e-9
+    late: Integers = order[same & (start[order] < before - rounding)]
+    return late

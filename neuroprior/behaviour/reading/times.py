@@ -20,14 +20,15 @@ THOUSANDS = r"-?\d{1,3}(,\d{3})+(\.\d*)?"
 
 NUMBERS, CLOCKS, DATES = "numbers", "times of day", "dates"
 
-HALF_A_DAY = 12 * 3600.0
+DAY = 86400.0
+"""Seconds."""
 
-SAMPLE = 2_000
-"""Texts by which a column is judged to hold times."""
+MAX_SAMPLE = 2_000
+"""Texts at most by which a column is judged to hold times."""
 
 
 class Times(NamedTuple):
-    """Times of a column.
+    """The times of a column.
 
     Attributes:
         values: float64 `[rows]`, NaN where there is none.
@@ -36,6 +37,23 @@ class Times(NamedTuple):
 
     values: Floats
     kind: str
+
+
+class _Texts(NamedTuple):
+    """The different texts of a column, and where complaints about them go."""
+
+    codes: NDArray[np.int64]
+    unique: NDArray[Any]
+    use: str
+    place: Place
+    problems: Problems
+
+    def complain(self, wrong: Any, right: str) -> None:
+        """Add a problem for the rows whose text is `wrong`, bool `[unique]`; `right` says what it must be."""
+        rows = np.flatnonzero(np.asarray(wrong, bool)[self.codes])
+        if rows.size:
+            text = self.unique[self.codes[rows[0]]]
+            self.problems.add(f"`{self.use}` must be {right}, got {text!r}", rows.tolist(), self.place)
 
 
 def read_times(
@@ -47,17 +65,18 @@ def read_times(
     separator: str = "",
     day_first: bool | None = None,
 ) -> Times:
-    """Return the times of a column of texts; what is no time is added to the problems.
+    """Return the times of a column of texts; texts that are no time are added to the problems.
 
     Args:
         texts: `[rows]`, without space at their ends.
         use: what they are, for messages.
         place: where a row stands.
-        problems: gets the entries that are no times.
-        separator: of the cells of the file: beside commas a comma is no decimal mark.
+        problems: receives a line for each kind of text that is no time.
+        separator: between the cells of the file; where it is a comma, no decimal mark is one.
         day_first: whether 1/2/2024 is the first of February; None: as the other dates of the column tell.
     """
     codes, unique = pd.factorize(np.asarray(texts, dtype=object))
+    column = _Texts(codes, unique, use, place, problems)
     words = pd.Series(unique, dtype=object)
     missing = words.str.lower().isin(MISSING_TIMES)
     numbers = pd.to_numeric(words.where(~missing), errors="coerce")
@@ -65,24 +84,23 @@ def read_times(
     commas = words[numbers.isna() & ~missing]
     if len(commas) and commas.str.fullmatch(r"-?\d*,\d+").all():
         if separator == "," and commas.str.fullmatch(THOUSANDS).all():
-            _complain(
-                problems, place, codes, unique, ~missing & numbers.isna(), use, "a number without thousands' commas"
-            )
+            column.complain(~missing & numbers.isna(), "a number without thousands' commas")
             return Times(numbers.to_numpy(np.float64)[codes], NUMBERS)
         numbers = pd.to_numeric(words.where(~missing).str.replace(",", ".", regex=False), errors="coerce")
     good = numbers.notna() & np.isfinite(numbers.to_numpy(np.float64))
-    if bool((good | missing).all()) or good.sum() > (~good & ~missing).sum():
-        _complain(problems, place, codes, unique, ~good & ~missing, use, "a number")
+    wrong = ~good & ~missing
+    if not wrong.any() or good.sum() > wrong.sum():
+        column.complain(wrong, "a number")
         return Times(numbers.where(good).to_numpy(np.float64)[codes], NUMBERS)
-    rest = words.where(~missing)
-    seconds = _clock_seconds(rest, ~missing, codes, unique, use, place, problems)
+    texts_or_empty = words.where(~missing, "")
+    seconds = _clock_seconds(texts_or_empty, column)
     if seconds is not None:
         return Times(seconds[codes], CLOCKS)
-    return Times(_date_seconds(rest, ~missing, codes, unique, use, place, problems, day_first)[codes], DATES)
+    return Times(_date_seconds(texts_or_empty, column, day_first)[codes], DATES)
 
 
 def _without_thousands(words: Any, numbers: Any, missing: Any, separator: str) -> tuple[Any, Any]:
-    """Return texts and numbers without marks between thousands, where these cannot be decimal marks."""
+    """Return texts and numbers without the marks between thousands, where these cannot be decimal marks."""
     rest = words[numbers.isna() & ~missing]
     if len(rest) and rest.str.fullmatch(r"-?\d{1,3}(,\d{3})+\.\d+").any() and rest.str.fullmatch(THOUSANDS).all():
         words = words.str.replace(",", "", regex=False)
@@ -96,34 +114,23 @@ def _without_thousands(words: Any, numbers: Any, missing: Any, separator: str) -
 
 
 def count_times(texts: NDArray[Any]) -> tuple[int, int, int]:
-    """Return how many of some texts are times of any kind, how many have a digit, and how many hold anything.
+    """Return how many texts are times of any kind, how many have a digit, and how many are not empty.
 
-    The first `SAMPLE` texts that differ are looked at.
+    Looks at the first `MAX_SAMPLE` different texts.
     """
-    words = pd.Series(pd.unique(np.asarray(texts, dtype=object))[:SAMPLE], dtype=object)
+    words = pd.Series(pd.unique(np.asarray(texts, dtype=object))[:MAX_SAMPLE], dtype=object)
     words = words[~words.str.lower().isin(MISSING_TIMES)]
     number = pd.to_numeric(words.str.replace(",", ".", regex=False), errors="coerce").notna()
     other = words.str.fullmatch(f"{CLOCK}|{DAYS}|{YEAR_LAST}") | words.str.fullmatch(YEAR_FIRST)
     return int((number | other).sum()), int(words.str.contains(r"\d").sum()), len(words)
 
 
-def _complain(
-    problems: Problems, place: Place, codes: NDArray[Any], unique: Any, wrong: Any, use: str, right: str
-) -> None:
-    wrong = np.asarray(wrong, bool)
-    rows = np.flatnonzero(wrong[codes])
-    if rows.size:
-        problems.add(f"`{use}` must be {right}, got {unique[codes[rows[0]]]!r}", rows.tolist(), place)
-
-
-def _clock_seconds(
-    words: Any, filled: Any, codes: Any, unique: Any, use: str, place: Place, problems: Problems
-) -> Floats | None:
-    """Return seconds of h:m:s, m:s and "1 days 00:00:01" texts; None where most are something else.
+def _clock_seconds(texts: Any, column: _Texts) -> Floats | None:
+    """Return the seconds of h:m:s, m:s and "1 days 00:00:01"; None where most texts are something else.
 
     Two numbers are minutes and seconds where one of the column has a fraction, or is beyond the hours of a day.
     """
-    texts = words.astype(object).where(filled, "")
+    filled = texts != ""
     days = texts.str.extract(f"^{DAYS}$")
     parts = texts.str.extract(f"^{CLOCK}$")
     with_days, clock = days[0].notna(), parts[2].notna()
@@ -134,25 +141,20 @@ def _clock_seconds(
     two = hours.isna() & clock
     if two.any() and not (parts[3][two].str.contains("[.,]") | (minutes[two] > 23)).any():
         right = "a time as h:m:s; two numbers may be hours and minutes, or minutes and seconds"
-        _complain(problems, place, codes, unique, two, use, right)
+        column.complain(two, right)
     half = parts[4].str.lower()
     hours = hours.where(half.isna(), hours % 12 + 12 * (half == "p"))
     values = sign * (3600 * hours.fillna(0) + 60 * minutes + seconds)
     values = values.where((seconds < 60) & (hours.isna() | (minutes < 60)))
     whole = days.astype(float).fillna(0)
-    values = values.where(~with_days, 86400 * whole[0] + 3600 * whole[1] + 60 * whole[2] + whole[3])
-    _complain(
-        problems, place, codes, unique, filled & values.isna(), use, "a time as h:m:s with minutes and seconds below 60"
-    )
-    found: Floats = values.to_numpy(np.float64)
-    return found
+    values = values.where(~with_days, DAY * whole[0] + 3600 * whole[1] + 60 * whole[2] + whole[3])
+    column.complain(filled & values.isna(), "a time as h:m:s with minutes and seconds below 60")
+    return np.asarray(values, np.float64)
 
 
-def _date_seconds(
-    words: Any, filled: Any, codes: Any, unique: Any, use: str, place: Place, problems: Problems, day_first: bool | None
-) -> Floats:
-    """Return seconds since 1970; dates without a time zone are all taken to be in one."""
-    texts = words.astype(object).where(filled, "")
+def _date_seconds(texts: Any, column: _Texts, day_first: bool | None) -> Floats:
+    """Return seconds since 1970; all dates without a time zone are taken to be in one zone."""
+    filled = texts != ""
     parts = texts.str.extract(f"^{YEAR_LAST}$")
     last = parts[0].notna()
     if last.any():
@@ -160,7 +162,7 @@ def _date_seconds(
         if day_first is None:
             if first.max() <= 12 and second.max() <= 12 and bool((first != second).any()):
                 right = "a date whose day can be told from its month; say --day_first true or false"
-                _complain(problems, place, codes, unique, last, use, right)
+                column.complain(last, right)
             day_first = bool(first.max() > 12 or second.max() <= 12)
         day, month = (parts[0], parts[1]) if day_first else (parts[1], parts[0])
         year = parts[2].where(parts[2].str.len() == 4, "20" + parts[2])
@@ -171,21 +173,12 @@ def _date_seconds(
     )
     normal = normal.str.replace(r"(:\d+),(\d+)", r"\1.\2", regex=True)
     dates = pd.to_datetime(normal.where(filled), format="ISO8601", utc=True, errors="coerce")
-    _complain(
-        problems,
-        place,
-        codes,
-        unique,
-        filled & dates.isna(),
-        use,
-        "a time: a number, h:m:s or a date as year-month-day",
-    )
-    found: Floats = (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(np.float64)
-    return found
+    column.complain(filled & dates.isna(), "a time: a number, h:m:s or a date as year-month-day")
+    return np.asarray((dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds(), np.float64)
 
 
 def over_midnight(values: Floats, unit: NDArray[np.int64]) -> tuple[Floats, int]:
-    """Return times of day that go on over midnight, and how often they do.
+    """Return times of day counted on over midnight, and the number of midnights.
 
     Where a time is more than half a day before the one above it of the same recording, a new day has begun.
 
@@ -195,9 +188,9 @@ def over_midnight(values: Floats, unit: NDArray[np.int64]) -> tuple[Floats, int]
     """
     series = pd.Series(values)
     before = series.groupby(unit).transform(lambda one: one.ffill().shift())
-    new = (series - before < -HALF_A_DAY).to_numpy()
+    new = (series - before < -DAY / 2).to_numpy()
     days = pd.Series(new).groupby(unit).cumsum().to_numpy(np.float64)
-    return values + 86400 * days, int(new.sum())
+    return values + DAY * days, int(new.sum())
 
 
 def smallest_unit(texts: NDArray[Any]) -> float:
