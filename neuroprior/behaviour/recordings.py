@@ -216,14 +216,14 @@ class Recordings:
         """
         if "observer" not in self.events:
             raise ValueError("`columns.observer` must be given for agreement, got recordings of one observer")
-        rows = []
+        rows, behaviours = [], sorted(pd.unique(self.events["behaviour"]))
         for _, one in self.events.groupby(KEYS, sort=False):
-            names = list(pd.unique(one["observer"]))
+            names = sorted(pd.unique(one["observer"]))
             for i, first in enumerate(names):
                 for second in names[i + 1 :]:
                     pair = one[one["observer"].isin([first, second])].dropna(subset=["start", "stop"])
                     if pair["observer"].nunique() == 2:
-                        rows += _both_done(pair, first, second)
+                        rows += _both_done(pair, first, second, behaviours)
         if not rows:
             raise ValueError(
                 "`columns.observer` must name observers who scored the same recordings, got none in common"
@@ -293,7 +293,9 @@ class Recordings:
         )
 
 
-def _both_done(pair: pd.DataFrame, first: str, second: str) -> list[tuple[str, str, str, float, float, float, float]]:
+def _both_done(
+    pair: pd.DataFrame, first: str, second: str, behaviours: Sequence[str]
+) -> list[tuple[str, str, str, float, float, float, float]]:
     """Return for each behaviour how long both observers, the first and the second say that it is done."""
     of_first, of_second = (pair[pair["observer"] == name] for name in (first, second))
     low = max(of_first["start"].min(), of_second["start"].min())
@@ -303,7 +305,7 @@ def _both_done(pair: pd.DataFrame, first: str, second: str) -> list[tuple[str, s
     edges = np.unique(np.clip(np.concatenate([pair["start"], pair["stop"], [low, high]]), low, high))
     middle, width = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
     rows: list[tuple[str, str, str, float, float, float, float]] = []
-    for behaviour in pd.unique(pair["behaviour"]):
+    for behaviour in behaviours:
         done, also = (_is_done(bouts[bouts["behaviour"] == behaviour], middle) for bouts in (of_first, of_second))
         both, one, other = (float(width[moments].sum()) for moments in (done & also, done, also))
         rows.append((first, second, str(behaviour), both, one, other, float(high - low)))

@@ -63,9 +63,9 @@ def _repeated_rows(table: Table, start: Floats, stop: Floats) -> NDArray[np.bool
 
 def _past_midnight(table: Table, start: Floats, stop: Floats) -> tuple[Floats, Floats]:
     """Return starts and stops counted on over midnight."""
+    of_day = start
     start, midnights = over_midnight(start, table.unit_codes())
-    days = np.floor(start / DAY) * DAY
-    stop = stop + np.where(np.isnan(days), 0, days)
+    stop = stop + np.nan_to_num(start - of_day)
     next_day = stop < start - DAY / 2
     stop = np.where(next_day, stop + DAY, stop)
     if midnights or next_day.any():

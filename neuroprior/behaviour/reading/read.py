@@ -1,5 +1,6 @@
 """Read recordings from files of laboratories."""
 
+import os
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -58,17 +59,22 @@ def read_recordings(paths: Any, options: Options) -> Recordings:
         raise ValueError("`paths` must be files, folders or pandas frames, got a Series; give series.to_frame()")
     is_one = isinstance(paths, str | pd.DataFrame) or not hasattr(paths, "__iter__")
     groups: list[list[Sheet]] = []
+    files: list[Path] = []
+    groups_of_files: list[list[Sheet]] = []
     for number, item in enumerate([paths] if is_one else paths):
         if isinstance(item, pd.DataFrame):
             name = "table" if is_one else f"table {number + 1}"
             groups.append([sheet_of_frame(item, name, name)])
         elif hasattr(item, "__fspath__") or isinstance(item, str):
-            groups += [read_sheets(file, wanted) for file in find_files(item)]
+            new = [file for file in find_files(item) if file not in files]
+            files += new
+            groups_of_files += [read_sheets(file, wanted) for file in new]
+            groups += groups_of_files[-len(new) :] if new else []
         else:
             raise ValueError(f"`paths` must be files, folders or pandas frames, got {type(item).__name__}")
     if not groups:
         raise ValueError("`paths` must be at least one file, got none")
-    _tell_stems_apart(groups)
+    _tell_stems_apart(groups_of_files, files)
     results = [_read_file(sheets, options) for sheets in groups]
     if problems := [problem for _, _, problems in results for problem in problems]:
         raise ReadingError(problems)
@@ -76,14 +82,19 @@ def read_recordings(paths: Any, options: Options) -> Recordings:
     return _combine(parts, [note for _, notes, _ in results for note in notes], options)
 
 
-def _tell_stems_apart(groups: list[list[Sheet]]) -> None:
-    """Put the folder before the stems of files of one name in several folders."""
+def _tell_stems_apart(groups: list[list[Sheet]], files: list[Path]) -> None:
+    """Put folders before the stems of files that are the same elsewhere, and the workbook before those of sheets."""
+    if len(files) < 2:
+        return
     count = Counter(stem for sheets in groups for stem in {sheet.stem for sheet in sheets})
-    for sheets in groups:
+    folder = Path(os.path.commonpath([file.absolute().parent for file in files]))
+    places = [file.absolute().relative_to(folder) for file in files]
+    stems = [str(place.with_suffix("")) for place in places]
+    for sheets, place, stem in zip(groups, places, stems, strict=True):
+        before = stem if stems.count(stem) == 1 else str(place)
         for sheet in sheets:
-            if count[sheet.stem] > 1 and sheet.is_file:
-                file = Path(sheet.name.split(", ")[0])
-                sheet.stem = f"{file.stem if len(sheets) > 1 else file.parent.name}/{sheet.stem}"
+            if count[sheet.stem] > 1:
+                sheet.stem = before if len(sheets) == 1 else f"{before}/{sheet.stem}"
 
 
 def _words_of_columns(columns: Columns) -> list[str]:
@@ -100,18 +111,25 @@ def _read_file(sheets: list[Sheet], options: Options) -> tuple[list[Part], list[
     parts: list[Part] = []
     unread: list[str] = []
     problems: list[str] = []
+    failed: list[set[str]] = []
+    names: list[str] = []
+    of_first: set[str] = set()
     for sheet in sheets:
-        if parts and len(sheets) > 1 and set(sheet.frame.columns) != set(parts[0].sheet.frame.columns):
+        columns = set(sheet.frame.columns)
+        if sheet.of_workbook and parts and columns != of_first:
             unread.append(sheet.name)
             continue
         try:
             parts.append(_read_sheet(sheet, options))
+            of_first = of_first or columns
         except ReadingError as error:
             problems += error.problems
-            unread.append(sheet.name)
-    if parts and len(sheets) > 1:
-        return parts, [f"{', '.join(unread)}: not read, since the columns are others"] if unread else [], []
-    return parts, [], problems
+            failed.append(columns)
+            names.append(sheet.name)
+    if parts and sheets[0].of_workbook and of_first not in failed:
+        # A sheet of another kind, such as the ethogram, may stand before or behind that of the events.
+        unread, problems = unread + names, []
+    return parts, [f"{', '.join(unread)}: not read, since the columns are others"] if unread else [], problems
 
 
 def _read_sheet(sheet: Sheet, options: Options) -> Part:

@@ -52,6 +52,7 @@ class Sheet:
         separator: between cells; "" where the file is no text.
         notes: what a user should know of how it was read.
         is_file: whether rows are numbered as lines of a file.
+        of_workbook: whether other sheets of the same file may hold something else.
     """
 
     name: str
@@ -63,6 +64,7 @@ class Sheet:
     separator: str = ""
     notes: list[str] = field(default_factory=list)
     is_file: bool = True
+    of_workbook: bool = False
 
     def place(self, row: int) -> str:
         """Return where a row stands, for messages."""
@@ -78,7 +80,8 @@ def find_files(path: str | os.PathLike[str]) -> list[Path]:
     """
     path = Path(path)
     if path.is_dir():
-        files = sorted(file for file in path.rglob("*") if _is_table(file))
+        inside = [file for file in path.rglob("*") if _is_table(file)]
+        files = sorted(file for file in inside if not any(part[0] == "." for part in file.relative_to(path).parts))
         if not files:
             raise ReadingError(f"{path}: the folder must hold tables ({', '.join(TABLE_SUFFIXES)}), got none")
         return files
@@ -174,7 +177,9 @@ def _sheets_of_workbook(content: bytes, label: str, stem: str, wanted: Sequence[
     for name, page in filled.items():
         cells = pd.DataFrame({i: _texts(page.iloc[:, i]) for i in range(page.shape[1])})
         called, page_stem = (label, stem) if len(filled) == 1 else (f"{label}, sheet {name!r}", str(name))
-        yield _sheet_of_cells(cells, np.arange(1, len(cells) + 1), called, page_stem, "", wanted)
+        sheet = _sheet_of_cells(cells, np.arange(1, len(cells) + 1), called, page_stem, "", wanted)
+        sheet.of_workbook = len(filled) > 1
+        yield sheet
 
 
 def _sheet_of_xes(content: bytes, label: str, stem: str) -> Sheet:

@@ -179,13 +179,14 @@ class Table:
     def labels(self, texts: NDArray[Any]) -> NDArray[Any]:
         """Return labels as the options say: renamed, "" where one is missing."""
         codes, values = pd.factorize(texts)
+        each = max(len(texts) // max(self.size, 1), 1)  # cells of a row, where a row is a sequence
         labels = [self.options.label(str(value)) for value in values]
         self.renamed |= {str(value) for value in values} & self.options.rename.keys()
         numbers = [label for label in labels if label]
         if "-1" in numbers and all(number.isdecimal() for number in numbers if number != "-1"):
             rows = np.flatnonzero(np.array(labels, dtype=object)[codes] == "-1")
             self.first_notes.append(
-                f"the label -1 ({rows.size:,} rows, first in {self.place(int(rows[0]) % max(self.size, 1))})"
+                f"the label -1 ({rows.size:,} rows, first in {self.place(int(rows[0]) // each)})"
                 " stands for none, as clusterings write it; --rename -1=noise makes it a behaviour"
             )
             labels = ["" if label == "-1" else label for label in labels]
@@ -193,7 +194,7 @@ class Table:
         if self.options.missing == "error" and (renamed == "").any():
             rows = np.flatnonzero(renamed == "")
             what = f"`behaviour` must be known, got {str(texts[rows[0]])!r}"
-            self.problems.add(what, (rows % max(self.size, 1)).tolist(), self.place)
+            self.problems.add(what, (rows // each).tolist(), self.place)
         return renamed
 
     def times(self, use: str) -> Times | None:

@@ -161,3 +161,47 @@ def test_many_small_recordings_take_no_time_each():
         }
     )
     assert read(frame).num_recordings == number
+
+
+def test_files_are_told_apart_by_as_many_folders_as_it_takes(study, tmp_path):
+    for place in ("m1/day1/a.csv", "m2/day1/a.csv", "m2/day1/a.tsv"):
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / place).write_text("behaviour,start,stop\nrest,0,5\nwalk,5,7\n")
+    (tmp_path / ".hidden").mkdir()
+    (tmp_path / ".hidden" / "a.csv").write_text("behaviour,start,stop\nrest,0,5\n")
+    found = read([tmp_path, tmp_path / "m1" / "day1" / "a.csv"])
+    assert list(dict.fromkeys(row[0] for row in rows(found))) == ["m1/day1/a", "m2/day1/a.csv", "m2/day1/a.tsv"]
+
+
+def test_clocks_beyond_a_day_are_not_moved(study):
+    found = study("animal,behaviour,start,stop\na,rest,25:00:00,25:10:00\na,walk,25:10:00,26:00:00\n")
+    assert [row[2:] for row in rows(found)] == [(90000, 90600), (90600, 93600)]
+
+
+def test_the_line_of_a_missing_state_in_a_row_of_states(study):
+    with pytest.raises(ValueError, match=r"line 4: `behaviour` must be known, got 'NA'"):
+        study("id,s1,s2,s3\n1,A,B,C\n2,B,B,A\n3,NA,C,A\n", missing="error")
+
+
+def test_agreement_counts_all_that_was_watched(study):
+    text = "session,animal,behaviour,start,stop,scorer\n"
+    first = [("s1", "rest", 0, 100)], [("s2", "rest", 0, 50), ("s2", "walk", 50, 60), ("s2", "rest", 60, 100)]
+    for scorers, events in zip((("A", "B"), ("B", "A")), first, strict=True):
+        for scorer in scorers:
+            text += "".join(f"{s},m1,{b},{start},{stop},{scorer}\n" for s, b, start, stop in events)
+    found = study(text, {"observer": "scorer"}).agreement().set_index("behaviour")
+    assert found["time"].to_dict() == {"rest": 200, "walk": 200}
+    assert set(found["first"]) == {"A"}
+    assert found["kappa"].to_dict() == pytest.approx({"rest": 1, "walk": 1})
+
+
+def test_an_error_in_one_of_like_sheets_is_no_other_kind(tmp_path):
+    pytest.importorskip("openpyxl")
+    pytest.importorskip("python_calamine")
+    with pd.ExcelWriter(tmp_path / "f.xlsx") as book:
+        for name, stop in (("day1", 5), ("day2", -1)):
+            pd.DataFrame({"behaviour": ["rest"], "start": [0], "stop": [stop]}).to_excel(
+                book, sheet_name=name, index=False
+            )
+    with pytest.raises(ValueError, match="sheet 'day2'"):
+        read(tmp_path / "f.xlsx")
