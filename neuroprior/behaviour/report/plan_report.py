@@ -146,11 +146,7 @@ def _cross_validate(
     if other is not None:
         other, cut = _in_parts(other)
     scored = learned if other is None else other
-    number = (
-        1
-        if other is not None
-        else _folds("plans" if isinstance(plans, Plans | Recordings) else name_files(plans), learned, fits)
-    )
+    number = 1 if other is not None else _folds(_name(plans), learned, fits)
     design = Design(number, fits.seed, skip, fits.max_steps, fits.effort, cut=cut)
     kinds: list[str] = [*fits.kinds]
     if with_lags:
@@ -171,7 +167,7 @@ def _cross_validate(
     settings: dict[str, Any] = {"models": ", ".join(kinds)} | found.settings
     settings |= {} if fits.modes is None else {"modes": sorted(set(fits.modes))}
     settings |= {"plans without actions, left out": empty} if empty else {}
-    settings |= {} if test is None else {"test": "plans" if isinstance(test, Plans | Recordings) else name_files(test)}
+    settings |= {} if test is None else {"test": _name(test)}
     return replace(found, plans=whole, settings=settings)
 
 
@@ -243,6 +239,13 @@ def _check_other_files(files: Plans | Recordings | Files, test: Plans | Recordin
         raise ValueError(f"`test` must be other plans than those that are learned from, got {test}.")
 
 
+def _name(plans: Plans | Recordings | Files) -> str:
+    """What messages call the plans: by their files, where they have any."""
+    if isinstance(plans, Recordings):
+        return name_files([source.name for source in plans.sources] or ["recordings"])
+    return "plans" if isinstance(plans, Plans) else name_files(plans)
+
+
 def _read(plans: Plans | Recordings | Files, reading: ReadOptions) -> RecordedPlans:
     """The plans, without an end symbol."""
     if isinstance(plans, Recordings):
@@ -253,7 +256,7 @@ def _read(plans: Plans | Recordings | Files, reading: ReadOptions) -> RecordedPl
 
 def _with_actions(plans: Plans | Recordings | Files, reading: ReadOptions) -> tuple[RecordedPlans, int]:
     """The plans that have actions, and how many have none: these are of no use to models."""
-    read, file = _read(plans, reading), "plans" if isinstance(plans, Plans | Recordings) else name_files(plans)
+    read, file = _read(plans, reading), _name(plans)
     if read.num_actions > MOST_ACTIONS:
         raise ValueError(
             f"{file}: action numbers go up to {read.num_actions - 1}; number the actions from 0, or write names"

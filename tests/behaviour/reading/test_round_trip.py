@@ -155,13 +155,17 @@ def test_rows_of_starts_and_stops(
 def test_rows_of_frames_and_columns_of_behaviours(
     study: pd.DataFrame, file: tuple[str, str, bool, str], words: dict[str, str]
 ) -> None:
-    rows = []
+    parts = []
     for (recording, subject), one in study.groupby(["recording", "subject"], sort=False):
-        for frame in range(round(one["stop"].max() * 10)):
-            now = (frame + 0.5) / 10
-            inside = one[(one["start"] < now) & (one["stop"] > now)]
-            rows.append((recording, subject, frame / 10, "" if inside.empty else inside["behaviour"].iloc[0]))
-    frames = pd.DataFrame(rows, columns=["recording", "subject", "time", "behaviour"])
+        frame = np.arange(round(one["stop"].max() * 10))
+        now = (frame + 0.5) / 10
+        at = np.searchsorted(one["start"].to_numpy(), now) - 1
+        done = (at >= 0) & (now < one["stop"].to_numpy()[at])
+        behaviour = np.where(done, one["behaviour"].to_numpy(object)[at], "")
+        parts.append(
+            pd.DataFrame({"time": frame / 10, "behaviour": behaviour}).assign(recording=recording, subject=subject)
+        )
+    frames = pd.concat(parts, ignore_index=True)[["recording", "subject", "time", "behaviour"]]
     runs = study.copy()  # a behaviour that goes on at once is one run
     same_events(
         read_back(frames.rename(columns={key: words[key] for key in ("recording", "subject", "behaviour")}), file), runs
