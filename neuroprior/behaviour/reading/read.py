@@ -3,6 +3,7 @@
 import os
 from collections import Counter
 from collections.abc import Mapping
+from itertools import combinations, islice
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,12 @@ from neuroprior.behaviour.reading.problems import Problems, ReadingError
 from neuroprior.behaviour.reading.sheets import Sheet, find_files, read_sheets, sheet_of_frame
 from neuroprior.behaviour.reading.table import JOIN, MAX_OVERLAP, SECONDS, Part, Table, overlapping
 from neuroprior.behaviour.recordings import KEYS, Recordings, Source
+
+MIN_TWIN_EVENTS, MIN_TWIN_SHARE = 4, 0.6
+"""Events of two recordings, and the share of them at the same time, at least which two observers may have scored."""
+
+MAX_TWIN_PAIRS, MAX_TWIN_NOTES = 300, 5
+"""Pairs of recordings that are compared, and notes on them, at most."""
 
 
 def read(paths: Any, columns: Columns | Mapping[str, Any] | None = None, **options: Any) -> Recordings:
@@ -245,6 +252,7 @@ def _combine(parts: list[Part], notes: list[str], options: Options) -> Recording
         events["subject"] = np.where(unowned, events["recording"], events["subject"])
         what = "no subject is known" if unowned.all() else f"{unowned.sum():,} events are of no subject"
         first.append(f"{what}: each recording is taken as one subject (--columns.subject)")
+    first += _notes_on_twins(events)
     share, row = _overlap_share(events)
     if share > MAX_OVERLAP and options.overlaps == "error":
         event = events.iloc[row]
@@ -283,6 +291,45 @@ def _combine(parts: list[Part], notes: list[str], options: Options) -> Recording
     if options.from_ is not None or options.to is not None:
         recordings = recordings.window(options.from_, options.to)
     return recordings
+
+
+def _notes_on_twins(events: pd.DataFrame) -> list[str]:
+    """Return a note where two recordings of a subject hold nearly the same events, as those of two observers do."""
+    several = events.groupby("subject")["recording"].transform("nunique") > 1
+    pairs = (
+        pair
+        for _, own in events[several].groupby("subject", sort=False)
+        for pair in combinations([one for _, one in own.groupby("recording", sort=False)], 2)
+    )
+    notes = []
+    for one, other in islice(pairs, MAX_TWIN_PAIRS):
+        if min(len(one), len(other)) < max(MIN_TWIN_EVENTS, 0.5 * max(len(one), len(other))):
+            continue
+        if min(_share_matched(one, other), _share_matched(other, one)) >= MIN_TWIN_SHARE:
+            names = " and ".join(repr(timeline["recording"].iloc[0]) for timeline in (one, other))
+            notes.append(
+                f"the recordings {names} of {one['subject'].iloc[0]!r} hold nearly the same events: if two people"
+                " scored one session, read the files of one of them"
+            )
+    return notes[:MAX_TWIN_NOTES]
+
+
+def _share_matched(one: pd.DataFrame, other: pd.DataFrame) -> float:
+    """Return the share of events for which the other recording has the same behaviour at nearly the same time."""
+    steps = np.diff(np.sort(one["start"].to_numpy(np.float64)))
+    if not np.isfinite(steps).all() or not (steps > 0).any():
+        return 0.0
+    tolerance = 0.15 * float(np.median(steps[steps > 0]))
+    matched = 0
+    for behaviour, events in one.groupby("behaviour"):
+        start = events["start"].to_numpy(np.float64)
+        candidates = np.sort(other.loc[other["behaviour"] == behaviour, "start"].to_numpy(np.float64))
+        if len(candidates):
+            after = np.searchsorted(candidates, start).clip(max=len(candidates) - 1)
+            before = (after - 1).clip(min=0)
+            gap = np.minimum(np.abs(candidates[after] - start), np.abs(candidates[before] - start))
+            matched += int((gap <= tolerance).sum())
+    return matched / len(one)
 
 
 def _convert_to_one_unit(parts: list[Part], notes: list[str]) -> str:

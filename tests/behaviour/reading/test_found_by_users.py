@@ -205,3 +205,15 @@ def test_an_error_in_one_of_like_sheets_is_no_other_kind(tmp_path):
             )
     with pytest.raises(ValueError, match="sheet 'day2'"):
         read(tmp_path / "f.xlsx")
+
+
+def test_two_observers_in_two_files_are_noted(study, tmp_path):
+    starts = [3.0, 9.5, 19.1, 24.2, 29.4, 36.0, 41.3]
+    for name, late in (("S1_Anna", 0.0), ("S1_Ben", 0.2), ("S2_Anna", 1.7)):
+        lines = [f"m1,{'abc'[i * i % 3]},{start + late * (1 + i % 2)},{start + 4.2}" for i, start in enumerate(starts)]
+        study("subject,behaviour,start,stop\n" + "\n".join(lines) + "\n", name=f"{name}.csv")
+    notes = read(tmp_path).notes
+    assert [note for note in notes if "nearly the same events" in note] == [
+        "the recordings 'S1_Anna' and 'S1_Ben' of 'm1' hold nearly the same events: if two people scored one session,"
+        " read the files of one of them"
+    ]
