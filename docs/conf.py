@@ -54,7 +54,10 @@ nb_output_stderr = "remove"  # progress
 nitpicky = True
 # names of other libraries, which only their own sites could resolve
 OTHERS = "torch|Tensor|numpy|np|pandas|matplotlib|lightning|rich|collections|contextlib|pathlib|abc|os"
-nitpick_ignore_regex = [("py:.*", rf"({OTHERS})(\..*)?")]
+nitpick_ignore_regex = [
+    ("py:.*", rf"({OTHERS})(\..*)?"),
+    ("py:.*", r"(typing\.Literal\[|neuroprior\.[\w.]+ \| ).*"),  # parts of the types of grouped attributes
+]
 autosummary_generate = True
 autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_member_order = "bysource"
@@ -161,7 +164,7 @@ def to_home(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: nod
     module, _, name = node["reftarget"].rpartition(".")
     try:
         value = pkgutil.resolve_name(f"{module}:{name}") if module else None
-    except (ImportError, AttributeError):
+    except (ImportError, AttributeError, ValueError):  # of a union of types only a part is a name
         value = None
     home = HOMES.get(id(value)) if module else BY_NAME.get(name)
     if home is None and value is not None and module.startswith("neuroprior"):

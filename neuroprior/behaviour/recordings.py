@@ -81,12 +81,12 @@ class Recordings:
 
     @property
     def num_recordings(self) -> int:
-        """The number of recordings: session 1 of two subjects is two."""
+        """Return how many recordings there are; session 1 of two subjects is two."""
         return len(self.events[KEYS].drop_duplicates()) + len(self.empty)
 
     @property
     def watched(self) -> pd.DataFrame:
-        """When each recording was watched: a frame with columns `recording, subject, start, stop`, a fragment a row.
+        """Return when each recording was watched, as a frame with `recording, subject, start, stop`, a fragment a row.
 
         Where rows are frames, a fragment lasts from the first to the last. Else it lasts from the start of its first
         event to its last stop, or to its last start where no stop is known.

@@ -89,7 +89,8 @@ def test_the_six_commands(installed: Path, tmp_path: Path) -> None:
     program = [str(installed / "python"), "-c", IN_ONE_PROCESS, json.dumps(commands)]
     said = done(program, tmp_path).stdout.split("$ ")
     assert (tmp_path / "study.csv").read_bytes() == (tmp_path / "expected.csv").read_bytes()
-    fitted, reported, scored, sampled = said[2:6]
+    checked, fitted, reported, scored, sampled = said[2:7]
+    assert "7,124 events of 8 behaviours, 24 recordings of 12 subjects" in checked
     assert "bits per action" in fitted
     assert (tmp_path / "gru" / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
     assert "report: report/report.html" in reported
