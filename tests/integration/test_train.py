@@ -83,6 +83,7 @@ def test_each_recipe(name, tmp_path, capsys):
     assert (tmp_path / "run" / "learning_curve.png").exists() == (name in ("gru", "transformer"))
 
 
+@pytest.mark.slow
 def test_python_m_train_is_the_same_program(tmp_path):
     arguments = [sys.executable, "-m", "train", *small("markov", tmp_path / "run")]
     done = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, timeout=300)
