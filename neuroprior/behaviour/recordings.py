@@ -164,6 +164,12 @@ class Recordings:
         stop = self.events["stop"].fillna(pd.Series(following, index=self.events.index))
         return self._replace_events(self.events.assign(stop=stop), self.fragment)
 
+    def summary(self) -> str:
+        """Return what `neuroprior check` shows: columns, counts, notes, behaviours, factors and the first events."""
+        from neuroprior.behaviour.summary import render_summary
+
+        return render_summary(self)
+
     def behaviours(self) -> pd.DataFrame:
         """Return a frame with a row a behaviour: its events, subjects, whole duration, and what is odd about it."""
         events = self.events.assign(duration=self.events["stop"] - self.events["start"])

@@ -118,3 +118,15 @@ def test_behaviours_say_what_is_odd():
         "dig": "one subject only",
         "wlak": "like 'walk', rare, one subject only",
     }
+
+
+def test_the_summary_says_what_was_read():
+    said = read(TABLE).summary()
+    for words in (
+        "7 events of 3 behaviours, 3 recordings of 2 subjects",
+        "35 units watched, 1 gaps",
+        "1 of 8 rows have no label",
+    ):
+        assert words in said
+    assert [line.split() for line in said.splitlines() if line.startswith("walk ")] == [["walk", "3", "1", "5"]]
+    assert [line.split() for line in said.splitlines() if line.startswith("m1 ")] == [["m1", "1", "1"]]
