@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from neuroprior.behaviour.reading.frames import are_frames, number_rows, read_labelled_frames
 from neuroprior.behaviour.reading.sequences import strings_of_sequences
 from neuroprior.behaviour.reading.table import MIN_REPEATS, Floats, Part, Table
-from neuroprior.behaviour.reading.times import CLOCKS, DAY, Times, over_midnight, smallest_unit
+from neuroprior.behaviour.reading.times import CLOCKS, DAY, Times, smallest_unit
 
 
 def rows_of_events(table: Table) -> Part:
@@ -64,12 +64,12 @@ def _repeated_rows(table: Table, start: Floats, stop: Floats) -> NDArray[np.bool
 def _past_midnight(table: Table, start: Floats, stop: Floats) -> tuple[Floats, Floats]:
     """Return starts and stops counted on over midnight."""
     of_day = start
-    start, midnights = over_midnight(start, table.unit_codes())
+    start = table.over_midnight(start)
     stop = stop + np.nan_to_num(start - of_day)
     next_day = stop < start - DAY / 2
     stop = np.where(next_day, stop + DAY, stop)
-    if midnights or next_day.any():
-        table.first_notes.append("times of day go on over midnight; they are counted on from the first day")
+    if next_day.any():
+        table.note_midnight()
     return start, stop
 
 

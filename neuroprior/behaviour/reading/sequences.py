@@ -29,13 +29,11 @@ def rows_of_sequences(table: Table) -> Part:
     if "recording" not in table.roles.at:
         if row_names and table.frame[row_names].is_unique:
             table.recording = table.frame[row_names].to_numpy(object)
-        elif "subject" in table.roles.at and pd.Series(table.subject).is_unique:
-            table.recording = table.subject
-        elif column := _names_of_rows(table):
+        elif not table.is_row_a_subject() and (column := _names_of_rows(table)):
             table.recording = table.frame[column].to_numpy(object)
             table.notes.append(f"the column {column!r} is taken for the names of the recordings")
         else:
-            table.recording = np.arange(1, table.size + 1).astype(str).astype(object)
+            table.name_rows()
     if empty:
         table.notes.append(f"{empty:,} rows have no behaviour (first in {table.place(int((reach == 0).argmax()))})")
         table.empty = [str(name) for name in table.recording[reach == 0]]
@@ -96,8 +94,7 @@ def strings_of_sequences(table: Table) -> Part | None:
             return None
     table.unit = "steps"
     if "recording" not in table.roles.at:
-        by_subject = "subject" in table.roles.at and pd.Series(table.subject).is_unique
-        table.recording = table.subject if by_subject else np.arange(1, table.size + 1).astype(str).astype(object)
+        table.name_rows()
     rows: list[int] = []
     labels: list[str] = []
     lengths: list[float] = []

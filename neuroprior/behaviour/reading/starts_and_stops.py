@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from neuroprior.behaviour.reading.names import WORDS, plain
 from neuroprior.behaviour.reading.table import MAX_OVERLAP, Floats, Integers, Part, Table, overlapping
-from neuroprior.behaviour.reading.times import CLOCKS, over_midnight
+from neuroprior.behaviour.reading.times import CLOCKS
 
 
 def rows_of_starts_and_stops(table: Table) -> Part:
@@ -21,9 +21,7 @@ def rows_of_starts_and_stops(table: Table) -> Part:
     assert times is not None
     when = times.values
     if times.kind == CLOCKS:
-        when, midnights = over_midnight(when, table.unit_codes())
-        if midnights:
-            table.first_notes.append("times of day go on over midnight; they are counted on from the first day")
+        when = table.over_midnight(when)
     texts = table.joined(table.roles.at["behaviour"])
     kinds = _kinds_of_rows(table)
     untimed = np.flatnonzero(np.isnan(when))

@@ -13,7 +13,7 @@ from neuroprior.behaviour.reading.names import NO_SUBJECT, TOTALS, plain
 from neuroprior.behaviour.reading.options import Options
 from neuroprior.behaviour.reading.problems import Problems
 from neuroprior.behaviour.reading.sheets import Sheet
-from neuroprior.behaviour.reading.times import NUMBERS, Times, read_times
+from neuroprior.behaviour.reading.times import NUMBERS, Times, over_midnight, read_times
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -139,12 +139,10 @@ class Table:
         texts = [self.frame[name].to_numpy(object) for name in names]
         if len(texts) == 1:
             return np.asarray(texts[0], dtype=object)
-        key = np.zeros(self.size, np.int64)
-        for codes, values in map(pd.factorize, texts):
-            key = key * (len(values) + 1) + codes
-        _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
+        codes = _number_rows(texts)
+        _, first = np.unique(codes, return_index=True)
         labels = [JOIN.join(str(one[i]) for one in texts if one[i]) for i in first]
-        return np.array([*labels, ""], dtype=object)[inverse]
+        return np.array(labels, dtype=object)[codes]
 
     def _name_of_file(self) -> str:
         name = self._above("observation id", "trial name", "observation", "video")
@@ -238,8 +236,31 @@ class Table:
 
     def unit_codes(self) -> Integers:
         """Return the number of the recording and subject (and observer) of each row."""
-        key = pd.Series(list(zip(self.recording, self.subject, self.observer, strict=True)), dtype=object)
-        return pd.factorize(key)[0].astype(np.int64)
+        return _number_rows([self.recording, self.subject, self.observer])
+
+    def over_midnight(self, times_of_day: Floats) -> Floats:
+        """Return times of day, float64 `[rows]`, counted on over midnight in each recording, and note it."""
+        counted, midnights = over_midnight(times_of_day, self.unit_codes())
+        if midnights:
+            self.note_midnight()
+        return counted
+
+    def note_midnight(self) -> None:
+        """Note, once, that times of day go on over midnight."""
+        what = "times of day go on over midnight; they are counted on from the first day"
+        if what not in self.first_notes:
+            self.first_notes.append(what)
+
+    def is_row_a_subject(self) -> bool:
+        """Return whether a column holds subjects, and no two rows share one."""
+        return "subject" in self.roles.at and pd.Series(self.subject).is_unique
+
+    def name_rows(self) -> None:
+        """Make each row a recording, named by its subject where no two rows share one, else by its number."""
+        if self.is_row_a_subject():
+            self.recording = self.subject
+        else:
+            self.recording = np.arange(1, self.size + 1).astype(str).astype(object)
 
     def split_sessions(self, start: Floats, labels: NDArray[Any], stop: Floats | None = None) -> None:
         """Make each session a recording of its own, where the time starts again within a recording.
@@ -329,6 +350,14 @@ class Table:
         fragment = np.unique(fragment, return_inverse=True)[1].astype(np.int64)
         part = Part(self.sheet, self.roles, events, fragment, rows, self.unit, self.notes, self.first_notes)
         return replace(part, empty=self.empty, renamed=self.renamed)
+
+
+def _number_rows(columns: list[NDArray[Any]]) -> Integers:
+    """Return a number for each row, int64 `[rows]`, equal where all columns are, in the order of appearance."""
+    numbers = np.zeros(len(columns[0]), np.int64)
+    for codes, values in map(pd.factorize, columns):
+        numbers = pd.factorize(numbers * (len(values) + 1) + codes)[0].astype(np.int64)
+    return numbers
 
 
 def _whole_numbers(keys: NDArray[Any]) -> NDArray[Any]:
