@@ -43,7 +43,6 @@ from neuroprior.control import (
 )
 from neuroprior.planners import FrontierPlanner, execute, oracle
 from neuroprior.priors import CombinedPrior, MixturePrior, StackedPrior, SwitchingPrior
-from neuroprior.priors.neural import cuda_graphs as recordings
 from neuroprior.puzzles import AStarPlanner, LevinPlanner, sliding_tiles, sokoban
 from neuroprior.sampling import sample_in_world
 from neuroprior.testing import check_prior, check_world
@@ -102,47 +101,6 @@ NETWORKS: dict[str, Callable[[], Any]] = {
     "transformer, window": lambda: TransformerPrior(A, 16, window=5),
     "transformer, features": lambda: TransformerPrior(A, 16, context_size=2),
 }
-
-
-@pytest.mark.parametrize("name", NETWORKS)
-def test_recorded_steps_draw_what_steps_draw(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the same random numbers, but for rounding; also after weights have changed, in place or not."""
-    prior = NETWORKS[name]().to(DEVICE)
-    context = None
-    if prior.takes_context:
-        context = index(500, 1)[:, 0] if prior.num_contexts else torch.randn(500, 2, generator=seeded(4))
-
-    def agree() -> bool:
-        drawn = []
-        for devices in ((), ("cuda",)):  # without recordings, and with them
-            monkeypatch.setattr(recordings, "DEVICES", devices)
-            drawn.append(prior.sample(500, 40, context, generator=seeded(2), method="ancestral"))
-        return float((drawn[0] == drawn[1]).float().mean()) > 0.999
-
-    monkeypatch.setattr(recordings, "WORTH", 1)
-    assert agree()
-    assert agree()
-    with torch.no_grad():
-        for weight in prior.parameters():
-            weight.mul_(3)
-    assert agree()
-    prior.to("cpu").to(DEVICE)
-    assert agree()
-    with torch.no_grad():
-        next(prior.parameters()).fill_(torch.nan)
-    with pytest.raises(ValueError, match="logits are NaN"):
-        prior.sample(500, 40, context, method="ancestral")
-
-
-def test_recorded_steps_of_vectors(monkeypatch: pytest.MonkeyPatch) -> None:
-    prior = VectorGRU(LOW, HIGH, width=16).fit(vectors(), generator=seeded(0), **QUICK).to(DEVICE)
-    past = vectors().actions[:, :5]
-    drawn = []
-    monkeypatch.setattr(recordings, "WORTH", 1)
-    for devices in ((), ("cuda",)):
-        monkeypatch.setattr(recordings, "DEVICES", devices)
-        drawn.append(prior.sample(30, 20, past=past, generator=seeded(2)))
-    torch.testing.assert_close(*drawn, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", ["gru", "gru, context", "transformer", "transformer, features"])

@@ -185,10 +185,9 @@ def _limits(rows: pd.DataFrame) -> Table:
 
 def _gpu(rows: pd.DataFrame) -> Table:
     columns: dict[str, Column] = {"job": "about", "CPU, seconds": "cpu_seconds:.3g", "GPU, seconds": "seconds:.3g"}
-    columns |= {"step by step": "step_seconds:.3g", "ratio": _short("ratio"), "peak MiB": _mebi("peak_bytes")}
+    columns |= {"ratio": _short("ratio"), "peak MiB": _mebi("peak_bytes")}
     shown = rows.assign(ratio=rows.cpu_seconds / rows.seconds)
-    caption = "step by step: on the GPU without recorded steps, in seconds. ratio: CPU / GPU."
-    return table(shown, columns, caption, f"On {rows.device.iloc[0]}, and on the CPU of the same machine")
+    return table(shown, columns, "ratio: CPU / GPU.", f"On {rows.device.iloc[0]}, and on the CPU of the same machine")
 
 
 def _mebi(name: str) -> Column:

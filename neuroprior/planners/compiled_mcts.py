@@ -18,7 +18,6 @@ from neuroprior.plans import action_dtype
 from neuroprior.priors.counts.history_prior import HistoryPrior
 from neuroprior.priors.neural.compiled_gru import BLOCK, Network, advance, on_one_thread
 from neuroprior.priors.neural.gru import GRUPrior
-from neuroprior.priors.prior import Prior
 from neuroprior.priors.uniform import UniformPrior
 from neuroprior.sampling.stepping import Steppable, Stepper
 from neuroprior.worlds.tabular import TabularWorld
@@ -521,8 +520,8 @@ def _search_all(
     known.state[:, 0] = state.numpy()
     known.code[:, 0] = int(planner.prior.start_node) if isinstance(planner.prior, HistoryPrior) else 0
     if isinstance(planner.prior, GRUPrior):
-        first = planner.prior.input_size
-        known.hidden[:, 0] = hidden[:, first : first + layers * size].numpy()
+        layers_state, _ = hidden[1] if planner.prior.takes_context else hidden
+        known.hidden[:, 0] = layers_state.flatten(1).numpy()
     moves = Moves(
         world.next_state.view(-1).numpy(), world.reward.reshape(-1).numpy(), world.reward.dim() == 2, world.num_states
     )
@@ -640,7 +639,7 @@ def _knows(prior: Steppable) -> bool:
     if isinstance(prior, HistoryPrior):
         own = type(prior)
         same = own.start is HistoryPrior.start and own.step is HistoryPrior.step and own._at is HistoryPrior._at
-        return same and own.advance is Prior.advance and prior.log_probs.dtype == torch.float32
+        return same and prior.log_probs.dtype == torch.float32
     if not isinstance(prior, GRUPrior) or prior.training or not prior.is_plain:
         return False
     return prior.head.weight.dtype == torch.float32
@@ -665,8 +664,7 @@ def policy_of(prior: Any, world: TabularWorld, temperature: float) -> Policy:
     elif isinstance(prior, GRUPrior):
         network = prior.arrays()
         if prior.takes_context:
-            inputs = torch.nn.functional.pad(observed.float().view(len(observed), -1), (1, 0))  # without actions
-            by_context = prior.context_gates(inputs)
+            by_context = prior.context_gates(observed)
     weights = ((logits - logits.amax(1, keepdim=True)) / temperature).exp().T.cumsum(0).T
     probs = (logits.double() / temperature).softmax(1)
     kinds = (torch.int64, torch.int64, torch.float32, torch.float64, torch.float32)

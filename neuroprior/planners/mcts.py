@@ -86,7 +86,7 @@ class MCTSPlanner(PriorPlanner):
     @torch.no_grad()
     def _state_size(self, world: World, state: Tensor) -> int:
         """Numbers in the largest state of the prior in a tree: states may grow, by as much with each action."""
-        stepper, now = Stepper(self.prior, in_place=False), state[:1]
+        stepper, now = Stepper(self.prior), state[:1]
         begun = stepper.start_in(world, now)[1]
         before = numbers_in(begun)
         if before == 0 or self.length == 1:
@@ -134,7 +134,7 @@ class _Trees:
         self.planner, self.world, self.generator = planner, world, generator
         batch, actions = len(state), world.num_actions
         self.draw = Draw(actions, planner.temperature, generator)
-        self.stepper = Stepper(planner.prior, in_place=False)
+        self.stepper = Stepper(planner.prior)
         self.logits, hidden = self.stepper.start_in(world, state)
         self.device = state.device
         self.child = torch.zeros(batch, 1, actions, dtype=torch.long)

@@ -162,15 +162,6 @@ class Prior(SavedModule):
             ValueError: an action or a context that the prior does not know.
         """
 
-    def advance(self, action: Tensor, state: Any, context: Tensor | None = None, room: int = 0) -> tuple[Tensor, Any]:
-        """As `step`, for callers that no longer need the old state: it may be overwritten.
-
-        Args:
-            action, state, context: see `step`.
-            room: number of further steps to come, for which memory may be allocated at once.
-        """
-        return self.step(action, state, context)
-
     @abstractmethod
     def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Learn from executed plans.

@@ -444,7 +444,7 @@ class _PriorStates:
     """
 
     def __init__(self, prior: Steppable, world: World, state: Tensor) -> None:
-        self.stepper, self.world, self.store = Stepper(prior, in_place=False), world, StateStore()
+        self.stepper, self.world, self.store = Stepper(prior), world, StateStore()
         _, before = self.stepper.start_in(world, state[:1])
         action = torch.zeros(len(state[:1]), dtype=torch.long, device=state.device)
         _, after = self.stepper.step_in(world, action, before, state[:1])

@@ -15,7 +15,6 @@ from neuroprior.sampling.draws import (
     Draw,
     are_few,
     check_temperature,
-    levels_worth_splitting,
     shuffled_rows,
     worth_splitting,
 )
@@ -249,7 +248,7 @@ def _sample_in_world(
             if keep_states:
                 own[2].append(plans.of_each(here))
             if k + 1 < len(steps):
-                after, memory = stepper.step_in(world, last, memory, here, len(steps) - k - 2)
+                after, memory = stepper.step_in(world, last, memory, here)
         ends[number] = plans.of_each(here), own
 
     share(draw_part, range(len(parts)))
@@ -337,7 +336,7 @@ def _begin(stepper: Stepper, num_roots: int, context: Tensor | None, past: Tenso
     behind = past.shape[-1]
     for t, action in enumerate(past.expand(num_roots, behind).unbind(1)):
         current = context[:, t + 1] if context is not None and per_step else None
-        logits, state = stepper.step(action, state, current, behind - t - 1)
+        logits, state = stepper.step(action, state, current)
     return logits, state
 
 
@@ -361,7 +360,7 @@ def _sample_masked(
         plans[:, t] = draw.actions(logits.masked_fill(~allowed, -torch.inf))
         if t + 1 < length:
             current = None if context is None else context[:, t + 1]
-            logits, state = stepper.step(plans[:, t], state, current, length - t - 2)
+            logits, state = stepper.step(plans[:, t], state, current)
     return plans.to(draw.dtype)
 
 
@@ -416,9 +415,7 @@ def _sample_from_roots(
         prefix, root = _taken(parent, prefix, root)
         prefix = torch.cat([prefix, action[:, None].to(draw.dtype)], 1)
         if prefix.shape[1] < length:
-            levels = levels_worth_splitting(len(counts), total, draw.num_actions)
-            room = min(length - prefix.shape[1] - 1, levels)
-            logits, state = stepper.step(action, select_rows(state, parent), None, room)
+            logits, state = stepper.step(action, select_rows(state, parent))
     row = shuffled_rows(counts, root, draw.generator)
     depth, begun = prefix.shape[1], prefix[row]
     if depth == length:
@@ -453,7 +450,7 @@ def _sample_one_by_one(
                         actions[part, k + 1 :] = rest
                         return
                 given = None if context is None else context[row[part], t + 1]
-                now, hidden = stepper.step(last, hidden, given, len(steps) - k - 2)
+                now, hidden = stepper.step(last, hidden, given)
 
     parts = _parts(len(row), logits, state, stepper.shares)
     if stepper.shares:

@@ -120,14 +120,6 @@ def worth_splitting(children: int, total: int) -> bool:
     return 8 * children <= total
 
 
-def levels_worth_splitting(prefixes: int, total: int, num_actions: int) -> int:
-    """How many more levels of a tree with so many prefixes are worth splitting, if all of them branch."""
-    levels = 0
-    while num_actions > 1 and worth_splitting(prefixes * num_actions ** (levels + 1), total):
-        levels += 1
-    return levels
-
-
 def shuffled_rows(counts: Tensor, root: Tensor, generator: torch.Generator) -> Tensor:
     """The prefix of each plan, prefix m `counts[m]` times: ordered by root, in random order within a root.
 

@@ -34,9 +34,8 @@ class Steppable(Protocol):
       this attribute, or None, they never get one. `check_context_of(context, num_plans, length)` raises ValueError for
       a context that does not fit.
     - `end`: the action that ends a plan.
-    - `advance(action, state, context, room)`: as `step`, but may overwrite the state; `room` more steps will follow.
-    - `advance_shared(action, state, context, row, room)`: as `advance`, where plans get the same input: `action [K]`
-      and `context [K, ...]` are the distinct ones, `row [N]` says which of them each plan gets.
+    - `step_shared(action, state, context, row)`: as `step`, where plans get the same input: `action [K]` and
+      `context [K, ...]` are the distinct ones, `row [N]` says which of them each plan gets.
     - `draw_rest(action, state, uniform, temperature)`: the actions `[N, T]` that follow `action [N]`, drawn with the
       numbers `uniform [T, N]`; None: not now, so that the prior is stepped.
     - `draw_plans(state, counts, length, temperature, generator)`: `counts[r]` plans `[N, length]` from each row of
@@ -63,7 +62,6 @@ class Stepper:
 
     Args:
         prior: any prior.
-        in_place: `step` may overwrite the state that it is given, where the prior can.
 
     Attributes:
         num_actions: A.
@@ -72,16 +70,15 @@ class Stepper:
         shares: whether several threads may step at once.
     """
 
-    def __init__(self, prior: Steppable, in_place: bool = True) -> None:
+    def __init__(self, prior: Steppable) -> None:
         self._prior: Any = prior
         self.num_actions = prior.num_actions
         self.context_per: Literal["plan", "step"] | None = getattr(prior, "context_per", None)
         self.end: int | None = getattr(prior, "end", None)
         self.shares: bool = getattr(prior, "shares_steps", False)
-        self._advance = getattr(prior, "advance", None) if in_place else None
-        self._draw_rest = getattr(prior, "draw_rest", None) if in_place and self.end is None else None
-        self._draw_plans = getattr(prior, "draw_plans", None) if in_place else None
-        self._advance_shared = getattr(prior, "advance_shared", None) if in_place else None
+        self._draw_rest = getattr(prior, "draw_rest", None) if self.end is None else None
+        self._draw_plans = getattr(prior, "draw_plans", None)
+        self._step_shared = getattr(prior, "step_shared", None)
 
     @property
     def device(self) -> torch.device:
@@ -121,15 +118,13 @@ class Stepper:
             logits, state = self._prior.start(batch_size) if context is None else self._prior.start(batch_size, context)
         return logits, state
 
-    def step(self, action: Tensor, state: State, context: Tensor | None = None, room: int = 0) -> tuple[Tensor, State]:
-        """Logits `[N, A]` of the next action, and the next state; `room` more steps will follow.
+    def step(self, action: Tensor, state: State, context: Tensor | None = None) -> tuple[Tensor, State]:
+        """Logits `[N, A]` of the next action, and the next state.
 
         After the end symbol nothing else has a probability above 0.
         """
         with self.threads_for(len(action)):
-            if self._advance is not None:
-                logits, state = self._advance(action, state, context, room)
-            elif context is None:
+            if context is None:
                 logits, state = self._prior.step(action, state)
             else:
                 logits, state = self._prior.step(action, state, context)
@@ -158,17 +153,15 @@ class Stepper:
         self.check_context(context, len(state))
         return self.start(len(state), context)
 
-    def step_in(
-        self, world: World, action: Tensor, state: State, reached: Tensor, room: int = 0
-    ) -> tuple[Tensor, State]:
+    def step_in(self, world: World, action: Tensor, state: State, reached: Tensor) -> tuple[Tensor, State]:
         """As `step`, after `action` led to the world's states `reached [N, ...]`; each is observed once."""
-        if self.context_per == "step" and self._advance_shared is not None and _numbered(reached):
+        if self.context_per == "step" and self._step_shared is not None and _numbered(reached):
             pair, row = (reached * self.num_actions + action).unique(return_inverse=True)
             context, action = world.context(pair // self.num_actions), pair % self.num_actions
             with self.threads_for(len(row)):
-                logits, state = self._advance_shared(action, state, context, row, room)
+                logits, state = self._step_shared(action, state, context, row)
             return logits, state
-        return self.step(action, state, world.context(reached) if self.context_per == "step" else None, room)
+        return self.step(action, state, world.context(reached) if self.context_per == "step" else None)
 
 
 def _numbered(reached: Tensor) -> bool:

@@ -52,7 +52,6 @@ def check_prior(prior: Any, length: int | None = None, num_plans: int = 20_000, 
             plans = torch.randint(actions, (7, steps), generator=generator).to(prior.device)
             context = _random_context(prior, 7, steps, generator, stays)
             _check_stepping(prior, plans, context, stays)
-            _check_advancing(prior, plans, context, stays)
         _check_total(prior, _random_context(prior, 1, length, generator, stays), length)
         for method in ("tree", "ancestral"):
             context = _random_context(prior, 1, length, generator, stays)
@@ -122,24 +121,6 @@ def _check_stepping(prior: Prior, plans: Tensor, context: Tensor | None, stays: 
             require(gap < rounding, f"reordering the state changes the logits by {gap:.2g} ({where})")
 
 
-def _check_advancing(prior: Prior, plans: Tensor, context: Tensor | None, stays: bool) -> None:
-    """`advance` gives what `step` gives, whether there is room or not, for all plans and for some."""
-    num, length = plans.shape
-    with torch.no_grad():
-        for room in (0, length):
-            logits, state = prior.start(num, _at(context, 0))
-            _, other = prior.start(num, _at(context, 0))
-            for t in range(length - 1):
-                given = None if stays else _at(context, t + 1)
-                logits, state = prior.step(plans[:, t], state, given)
-                again, other = prior.advance(plans[:, t], other, given, room)
-                gap = float((again - logits).abs().nan_to_num(0).max())
-                require(gap < 1e-4, f"advance differs from step by {gap:.2g} (action {t}, room {room})")
-                if t % 2:  # states that were picked out go on by themselves
-                    other = select_rows(other, torch.arange(num, device=plans.device))
-
-
-@torch.no_grad()
 def _check_refusals(prior: Prior, generator: torch.Generator) -> None:
     """Unknown actions and contexts are refused, as `Prior.check_start` and `Prior.check_step` do."""
     context = _at(_random_context(prior, 3, 1, generator), 0)

@@ -7,6 +7,7 @@ import lightning
 import torch
 from torch import Tensor, nn
 
+from neuroprior.sampling.states import State, map_state
 from neuroprior.training.batches import Batch
 
 
@@ -31,7 +32,7 @@ class PriorModule(lightning.LightningModule):
         super().__init__()
         self.prior, self.learning_rate, self.weight_decay, self.seed = prior, learning_rate, weight_decay, seed
         self.curve: list[dict[str, float]] = []
-        self._hidden: Tensor | None = None
+        self._hidden: State | None = None
 
     def on_train_epoch_start(self) -> None:
         self.prior.train()
@@ -81,7 +82,7 @@ class PriorModule(lightning.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
-def bits(prior: nn.Module, batch: Batch, hidden: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor | None]:
+def bits(prior: nn.Module, batch: Batch, hidden: State | None = None) -> tuple[Tensor, Tensor, State | None]:
     """The loss of a prior on a batch.
 
     Args:
@@ -94,11 +95,11 @@ def bits(prior: nn.Module, batch: Batch, hidden: Tensor | None = None) -> tuple[
         plans).
     """
     taken, hidden = _log_probs(prior, batch, hidden if batch.continues else None)
-    hidden = None if hidden is None or batch.previous is None else hidden.detach()
+    hidden = None if hidden is None or batch.previous is None else map_state(torch.detach, hidden)
     return -(taken * batch.weight).sum() / log(2), batch.weight.sum(), hidden
 
 
-def _log_probs(prior: Any, batch: Batch, hidden: Tensor | None) -> tuple[Tensor, Tensor | None]:
+def _log_probs(prior: Any, batch: Batch, hidden: State | None) -> tuple[Tensor, State | None]:
     """Nats `[N, T]` of a batch's actions, and the hidden state after them."""
     if batch.actions.is_floating_point():
         taken, hidden = prior.log_probs_from(batch.actions, batch.context, batch.previous, hidden)

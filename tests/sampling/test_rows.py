@@ -1,9 +1,9 @@
-"""Tests of memory: taken rows are those asked for, and room is given to nobody else."""
+"""Tests of rows: those taken are those asked for."""
 
 import pytest
 import torch
 
-from neuroprior.sampling.rows import extended, rows_of, states_with_room
+from neuroprior.sampling.rows import rows_of
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.int32, torch.int64, torch.float32, torch.bfloat16])
@@ -35,26 +35,3 @@ def test_gradients_pass():
     rows_of(values, torch.tensor([1, 1, 3])).sum().backward()
     assert values.grad is not None
     assert values.grad[:, 0].tolist() == [0, 2, 0, 1]
-
-
-def test_states_are_extended_where_there_is_room_and_nowhere_else():
-    state = states_with_room(torch.zeros(5, 1), 3, 2)
-    state[:] = torch.arange(15).view(5, 3)
-    after = extended(state, 5)
-    assert after is not None
-    assert after[:, :3].equal(state)
-    assert after.data_ptr() == state.data_ptr()
-    assert extended(state, 6) is None
-    for other in (state[1:], state[:, 1:], state[::2], state.clone(), torch.zeros(5, 8)[:, :3]):
-        assert extended(other, 4) is None
-
-
-def test_rows_of_states_with_room_have_room_of_their_own():
-    state = states_with_room(torch.zeros(3, 1), 2, 2)
-    state[:] = torch.arange(6).view(3, 2)
-    taken = rows_of(state, torch.tensor([2, 2]))
-    assert taken.tolist() == [[4, 5], [4, 5]]
-    after = extended(taken, 4)
-    assert after is not None
-    after.fill_(9)
-    assert state.tolist() == [[0, 1], [2, 3], [4, 5]]

@@ -394,9 +394,9 @@ def test_in_world_same_seed_and_sizes():
 class WatchedGRU(GRUPrior):
     """Notes the distinct inputs, and the plans that they are for, of the steps in which inputs are shared."""
 
-    def advance_shared(self, action, state, context, row, room=0):
+    def step_shared(self, action, state, context, row):
         self.shared.append((torch.stack([action, context], 1), row))
-        return super().advance_shared(action, state, context, row, room)
+        return super().step_shared(action, state, context, row)
 
 
 @pytest.mark.parametrize(("lags", "window"), [(1, None), (1, 2), (3, None), (1, 0)])

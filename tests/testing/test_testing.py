@@ -156,14 +156,6 @@ class WrongStep(Broken):
         return torch.zeros(*plans.shape, self.num_actions)
 
 
-class WrongAdvance(Broken):
-    def advance(
-        self, action: Tensor, state: Tensor, context: Tensor | None = None, room: int = 0
-    ) -> tuple[Tensor, Tensor]:
-        logits, state = self.step(action, state, context)
-        return logits.roll(1, -1) if room else logits, state
-
-
 class HiddenMemory(Broken):
     """Keeps what it knows of a row in itself, so that reordering the state does not reorder it."""
 
@@ -233,7 +225,6 @@ class Unsavable(Broken):
     ("broken", "message"),
     [
         (WrongStep, "stepping differs from forward"),
-        (WrongAdvance, "advance differs from step"),
         (HiddenMemory, "stepping differs from forward|reordering the state"),
         (Unnormalised, "sum to 1.1"),
         (WrongSamples, "do not fit log_prob"),

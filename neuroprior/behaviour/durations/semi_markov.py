@@ -89,11 +89,6 @@ class SemiMarkovPrior(Prior):
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         return self.actions.step(action, state, context)
 
-    def advance(
-        self, action: Tensor, state: Tensor, context: Tensor | None = None, room: int = 0
-    ) -> tuple[Tensor, Tensor]:
-        return self.actions.advance(action, state, context, room)
-
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         logits: Tensor = self.actions(plans, context)
         return logits

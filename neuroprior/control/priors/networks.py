@@ -18,7 +18,6 @@ from neuroprior.control.priors.vector_prior import GaussianForecast, VectorPrior
 from neuroprior.control.vector_plans import VectorPlans
 from neuroprior.plans.folds import check_alike
 from neuroprior.plans.sequences import Sequences
-from neuroprior.priors.neural.cuda_graphs import run_recorded
 from neuroprior.priors.neural.features import Standardise
 from neuroprior.priors.neural.gru import gru_step
 
@@ -255,19 +254,12 @@ class VectorGRU(VectorPrior):
         last = forecast.repeat_interleave(each).drawn(uniform[:, 0], noise[:, 0])
         state = state.repeat_interleave(each, 0)
         numbers = uniform[:, 1:].transpose(0, 1), noise[:, 1:].transpose(0, 1)
-        rest = run_recorded(self, self._next, last, state, numbers, self.autoregressive_share)
-        if rest is not None:
-            return torch.cat([last[:, None], rest.transpose(0, 1)], 1)
         vectors = [last]
         for each_uniform, each_noise in zip(*numbers, strict=True):
-            last, state = self._next(last, state, each_uniform, each_noise)
+            forecast, state = self.step(last, state)
+            last = forecast.drawn(each_uniform, each_noise)
             vectors.append(last)
         return torch.stack(vectors, 1)
-
-    def _next(self, last: Tensor, state: Tensor, uniform: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """The next vectors `[N, D]`, and the state before them."""
-        forecast, state = self.step(last, state)
-        return forecast.drawn(uniform, noise), state
 
     def _after(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         """The distribution after the last of `inputs [N, T, E]`, and the state."""

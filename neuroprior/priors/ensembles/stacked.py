@@ -298,20 +298,20 @@ class Mixer(NeuralPrior):
             nn.init.zeros_(layer.weight)
             nn.init.constant_(layer.bias, first)
 
-    def encode(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        vectors = self.action(inputs[..., 0].long())
-        rest = inputs[..., 1:]
+    def encode(self, previous: Tensor, context: Tensor | None, hidden: State | None = None) -> tuple[Tensor, State]:
+        """See `NeuralPrior.encode`; `hidden` is the layers' hidden states `[N, layers, H]`."""
+        assert context is not None
+        vectors, rest = self.action(previous), context
         if self.index is not None:
             vectors, rest = vectors + self.index(rest[..., 0].long()), rest[..., 1:]
         rest = rest.to(self.features.weight.dtype)
-        hidden = None if hidden is None else hidden.to(rest.dtype)
         forecasts = rest[..., : self.num_experts * self.num_actions]
         vectors = vectors + self.features(rest / 2)
-        layers = None if hidden is None else hidden.unflatten(1, (self.num_layers, -1)).transpose(0, 1)
+        layers = None if hidden is None else hidden.transpose(0, 1)
         out, layers = gru_sequence(self.gru, self.drop(vectors), layers)
         out = self.drop(out)
         mixed = (self.weights(out)[..., None] * forecasts.unflatten(-1, (self.num_experts, -1))).sum(-2)
-        return self.head(out) + mixed, layers.transpose(0, 1).flatten(1)
+        return self.head(out) + mixed, layers.transpose(0, 1)
 
 
 def context_for(expert: Prior, context: Tensor | None) -> Tensor | None:

@@ -9,6 +9,7 @@ from torch.nn import functional
 from neuroprior._checks import check_memory, check_sizes
 from neuroprior._threads import one_thread, share
 from neuroprior.priors.neural.neural import Embedding, NeuralPrior
+from neuroprior.sampling.states import State
 
 DRAW_FROM = 4096
 """Numbers in the hidden states of plans from which they are drawn to their ends by one compiled loop."""
@@ -76,54 +77,69 @@ class GRUPrior(NeuralPrior):
         self.drop = nn.Dropout(self.dropout)
         self.head = nn.Linear(width, self.num_actions)
 
-    def encode(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        layers, recent, size = None, None, self.num_layers * self.hidden_size
-        if hidden is not None:
-            layers = hidden[:, :size].unflatten(1, (self.num_layers, self.hidden_size)).transpose(0, 1)
-            recent = hidden[:, size:]
-        if layers is not None and recent is not None and self._may_step(inputs):
-            out, layers, recent = self._one_step(inputs, layers, recent)
-        else:
-            vectors, recent = self.embedding(inputs, recent, self.window)
-            out, layers = gru_sequence(self.gru, self.drop(vectors), layers)
-        hidden = layers.transpose(0, 1).flatten(1)
-        return self.head(self.drop(out)), hidden if recent.shape[1] == 0 else torch.cat([hidden, recent], 1)
+    def encode(self, previous: Tensor, context: Tensor | None, hidden: State | None = None) -> tuple[Tensor, State]:
+        """See `NeuralPrior.encode`.
 
-    def advance_shared(
-        self, action: Tensor, state: Tensor, context: Tensor, row: Tensor, room: int = 0
-    ) -> tuple[Tensor, Tensor]:
-        """As `advance`, where many plans get the same input; its vectors and gates are computed once.
+        `hidden` is the layers' hidden states `[N, layers, H]`, and the last `lags` - 1 actions.
+        """
+        layers, recent = (None, None) if hidden is None else hidden
+        layers = None if layers is None else layers.transpose(0, 1)
+        if layers is not None and self._looks_up(previous, context):
+            row = previous[:, 0].int()
+            out, layers = gru_step(self.gru, self.embedding.action.weight, layers, rows=row)
+            out = out[:, None]
+        else:
+            vectors, recent = self.embedding(previous, context, recent, self.window)
+            out, layers = gru_sequence(self.gru, self.drop(vectors), layers)
+        return self.head(self.drop(out)), (layers.transpose(0, 1), recent)
+
+    def _looks_up(self, previous: Tensor, context: Tensor | None) -> bool:
+        """Whether the gates of each action are computed once: where these depend on it alone, and plans are more."""
+        alone = context is None and self.lags == 1 and len(previous) > self.num_actions
+        return alone and self._may_step(previous)
+
+    def step_shared(self, action: Tensor, state: State, context: Tensor, row: Tensor) -> tuple[Tensor, State]:
+        """As `step`, where many plans get the same input; its vectors and gates are computed once.
 
         Args:
             action: integers `[K]`, the distinct ones.
-            state, room: see `advance`.
+            state: see `step`.
             context: `[K]` or `[K, C]`: that of the next action, with each.
             row: integers `[N]`: which of the K each plan gets.
         """
         own = type(self).encode is GRUPrior.encode and type(self).step is NeuralPrior.step
-        inputs = self._inputs(action, context, None)
-        if not own or self.lags > 1 or self.window == 0 or not self._may_step(inputs[:, None]):
-            return self.advance(action[row], state, context[row], room)
-        layers = state[:, self.input_size :].unflatten(1, (self.num_layers, self.hidden_size)).transpose(0, 1)
-        vectors, _ = self.embedding(inputs[:, None], None, self.window)
-        out, layers = gru_step(self.gru, vectors[:, 0], layers, row.int())
-        return self.head(out), torch.cat([inputs.index_select(0, row), layers.transpose(0, 1).flatten(1)], 1)
+        if not own or self.lags > 1 or self.window == 0 or not self._may_step(action[:, None]):
+            return self.step(action[row], state, context[row])
+        vectors, _ = self.embedding(action.long()[:, None], context[:, None], None, self.window)
+        layers, recent = state[1]
+        out, layers = gru_step(self.gru, vectors[:, 0], layers.transpose(0, 1), row.int())
+        return self.head(out), (context.index_select(0, row), (layers.transpose(0, 1), recent))
 
-    def draw_rest(self, action: Tensor, state: Tensor, uniform: Tensor, temperature: float) -> Tensor | None:
-        """As that of `NeuralPrior`; on a CPU by one compiled loop, where plans are many.
+    def draw_rest(self, action: Tensor, state: State, uniform: Tensor, temperature: float) -> Tensor | None:
+        """The rest of many plans, drawn on a CPU by one compiled loop; see `neuroprior.sampling.Steppable`.
 
-        The state is `[N, D + K H + lags - 1]`, of K layers.
+        If they have a context, it goes on.
+
+        Args:
+            action: integers `[N]`, the last ones.
+            state: before these.
+            uniform: `[T, N]`: what the next T actions are drawn with.
+            temperature: divides the logits.
+
+        Returns:
+            int64 `[N, T]`; None where the loop does not pay, or does not know this prior.
         """
-        if state.device.type != "cpu":
-            return super().draw_rest(action, state, uniform, temperature)
+        context, (layers, recent) = state if self.takes_context else (None, state)
+        if layers.device.type != "cpu":
+            return None
         size, (steps, number), kinds = self.hidden_size, uniform.shape, self.num_actions
         # Tables of what each of the last actions adds have to be worth their making.
         worth = 4 * self.lags * kinds <= number * steps and 3 * size * self.lags * kinds <= LARGEST
         able = (
             worth
             and number * size >= DRAW_FROM
-            and state.dtype == uniform.dtype == torch.float32
-            and self._may_step(state[:, None])
+            and layers.dtype == uniform.dtype == torch.float32
+            and self._may_step(action[:, None])
         )
         if not (able and self.is_plain):
             return None
@@ -131,11 +147,10 @@ class GRUPrior(NeuralPrior):
 
         if not compiled_gru.on_one_thread(size, kinds):
             return None
-        last, hidden, recent = state.split([self.input_size, self.num_layers * size, self.lags - 1], 1)
-        given = self.context_gates(last) if self.takes_context else state.new_empty(0, 3 * size)
-        line = torch.cat([recent.long(), action[:, None], action.new_empty(number, steps)], 1)
-        hidden = hidden.unflatten(1, (self.num_layers, size))
-        arrays: Any = (x.detach().contiguous().numpy() for x in (given, hidden, line, uniform))
+        given = layers.new_empty(0, 3 * size) if context is None else self.context_gates(context)
+        line = torch.cat([recent, action.long()[:, None], recent.new_empty(number, steps)], 1)
+        # The loop overwrites the hidden states.
+        arrays: Any = (x.detach().contiguous().numpy() for x in (given, layers.clone(), line, uniform))
         draw: Any = compiled_gru.draw_to_the_end
         draw(compiled_gru.Network(*self.arrays()), *arrays, float(temperature))
         return line[:, self.lags :]
@@ -145,9 +160,9 @@ class GRUPrior(NeuralPrior):
         parts = (type(self), type(self.embedding), type(self.gru), type(self.head))
         return parts == (GRUPrior, Embedding, nn.GRU, nn.Linear) and super().is_plain
 
-    def context_gates(self, inputs: Tensor) -> Tensor:
-        """What the contexts of `inputs [N, D]` add to the gates of the first layer: `[N, 3 * hidden_size]`."""
-        return self.embedding.of_context(inputs[:, None])[:, 0] @ self.gru.all_weights[0][0].T
+    def context_gates(self, context: Tensor) -> Tensor:
+        """What contexts `[N]` or `[N, C]` add to the gates of the first layer: `[N, 3 * hidden_size]`."""
+        return self.embedding.of_context(context[:, None])[:, 0] @ self.gru.all_weights[0][0].T
 
     def arrays(self) -> tuple[Any, ...]:
         """The parts of `neuroprior.priors.neural.compiled_gru.Network`: weights, and what actions add to the gates."""
@@ -163,30 +178,10 @@ class GRUPrior(NeuralPrior):
         )  # fmt: skip
         return tuple(x.detach().float().contiguous().numpy() for x in parts)
 
-    def _may_step(self, inputs: Tensor) -> bool:
-        """Whether `_one_step` gives the same as `nn.GRU`, and faster."""
-        plain = not (self.training or torch.is_grad_enabled() or torch.is_autocast_enabled(inputs.device.type))
-        return plain and inputs.shape[1] == 1
-
-    def _one_step(self, inputs: Tensor, layers: Tensor, recent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The output of `nn.GRU` for a single input; see `gru_step`.
-
-        Args:
-            inputs: `[N, 1, D]`.
-            layers: `[layers, N, hidden_size]`, the hidden states.
-            recent: `[N, lags - 1]`: the actions before, see `Embedding`.
-
-        Returns:
-            The output `[N, 1, hidden_size]`, the new `layers` and the new `recent`.
-        """
-        # Input gates that depend on an action alone are looked up, where there are more plans than actions.
-        if self.takes_context or self.lags > 1 or len(inputs) <= self.num_actions:
-            vectors, recent = self.embedding(inputs, recent, self.window)
-            out, layers = gru_step(self.gru, vectors[:, 0], layers)
-        else:
-            action = inputs[:, 0, 0].int()
-            out, layers = gru_step(self.gru, self.embedding.action.weight, layers, rows=action)
-        return out[:, None], layers, recent
+    def _may_step(self, previous: Tensor) -> bool:
+        """Whether `gru_step` gives the same as `nn.GRU` for actions `[N, T]`, and faster."""
+        plain = not (self.training or torch.is_grad_enabled() or torch.is_autocast_enabled(previous.device.type))
+        return plain and previous.shape[1] == 1
 
 
 def gru_sequence(gru: nn.GRU, inputs: Tensor, layers: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -200,11 +195,11 @@ def gru_sequence(gru: nn.GRU, inputs: Tensor, layers: Tensor | None = None) -> t
     Returns:
         The output `[N, T, width]`, and the new `layers`.
     """
-    plain = inputs.dtype == torch.float32 and not torch.is_autocast_enabled(inputs.device.type)
-    if layers is not None and inputs.shape[1] == 1 and plain and not torch.is_grad_enabled():
+    rough = torch.is_autocast_enabled(inputs.device.type)
+    if layers is not None and inputs.shape[1] == 1 and not (rough or gru.training or torch.is_grad_enabled()):
         out, layers = gru_step(gru, inputs[:, 0], layers)
         return out[:, None], layers
-    if not plain or inputs.device.type != "cpu" or inputs.numel() == 0:
+    if rough or inputs.dtype != torch.float32 or inputs.device.type != "cpu" or inputs.numel() == 0:
         out, layers = gru(inputs, None if layers is None else layers.contiguous())
         return out, layers
     from neuroprior.priors.neural.compiled_gru import Sequence
@@ -232,7 +227,6 @@ def gru_step(gru: nn.GRU, below: Tensor, layers: Tensor, rows: Tensor | None = N
         The output `[N, width]`, and the new `layers`.
     """
     after = []
-    layers = layers.to(gru.all_weights[0][1].dtype)  # states are in single precision beside numbers of actions
     if layers.device.type != "cpu" or layers.dtype != torch.float32:
         below = below if rows is None else below.index_select(0, rows)
         for before, weights in zip(layers, gru.all_weights, strict=True):

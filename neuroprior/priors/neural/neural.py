@@ -12,19 +12,15 @@ from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import check_alike
 from neuroprior.priors.learning import training_plans, validation_plans
-from neuroprior.priors.neural import cuda_graphs as recordings
 from neuroprior.priors.neural.features import Standardise
 from neuroprior.priors.prior import Prior
-from neuroprior.sampling.draws import Draw, check_possible
+from neuroprior.sampling.states import State
 
 CONTEXT_SPREAD = 0.03
 """Standard deviation of contexts' initial vectors. With 1, as for other embeddings, small data sets are overfitted."""
 
 LAG_WIDTH = 16
 """Size of the embedding of each of the last actions."""
-
-IMPOSSIBLE = -1
-"""Stands for an action where none can be drawn."""
 
 SHORT = 32
 """Plans of at most so many actions are short: each input shows a network the last actions directly."""
@@ -82,9 +78,9 @@ class NeuralPrior(Prior):
     state carried from each to the next (truncated backpropagation through time). A prior trained in this way carries
     its hidden state on in use as well, without limit.
 
-    In this class "hidden" is what the network carries along a sequence, `[N, H]`: the hidden state of a recurrent
-    network, the key-value cache of a transformer. The prior's `state` is the last input, whose context may go on, and
-    it: `[N, D + H]`, D = 1 + (1 for a context index, C for features).
+    In this class "hidden" is what the network carries along a sequence, a tensor or a tuple of tensors, each with N
+    rows: the hidden state of a recurrent network, the key-value cache of a transformer. It is the prior's `state`; that
+    of a prior with a context is the last context, which may go on, and it.
 
     A subclass writes `build` and `encode`.
 
@@ -127,7 +123,6 @@ class NeuralPrior(Prior):
         check_sizes(lags=1 if lags is None else lags)
         self._given = (width, lags, dropout, num_layers)
         self._seed, self.sized = seed, False
-        self.input_size = 1 + (1 if num_contexts is not None else context_size or 0)
         self._make(Sizes())
 
     def _make(self, sizes: Sizes) -> None:
@@ -176,15 +171,16 @@ class NeuralPrior(Prior):
         """Make the layers."""
 
     @abstractmethod
-    def encode(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def encode(self, previous: Tensor, context: Tensor | None, hidden: State | None = None) -> tuple[Tensor, State]:
         """Read a sequence.
 
         Args:
-            inputs: `[N, T, D]`: the previous action (A for none) and the context, as floating point numbers.
-            hidden: `[N, H]`, after the inputs before these; None: there are none.
+            previous: int64 `[N, T]`: the action before each step, A for none.
+            context: `[N, T]` or `[N, T, C]`; None for a prior without context.
+            hidden: after the steps before these; None: there are none.
 
         Returns:
-            Logits `[N, T, A]`, and `hidden` `[N, H']` after the last input.
+            Logits `[N, T, A]`, and `hidden` after the last step.
         """
 
     def set_training_window(self, window: int | None) -> None:
@@ -207,83 +203,49 @@ class NeuralPrior(Prior):
         self.window = None
 
     @torch.no_grad()
-    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, State]:
         self.check_start(batch_size, context)
-        previous = torch.full((batch_size,), self.num_actions, device=self.device)
-        inputs = self._inputs(previous, context, None)
-        logits, hidden = self.encode(inputs[:, None])
-        return logits[:, 0], torch.cat([inputs, hidden], 1)
+        return self._read(torch.full((batch_size,), self.num_actions, device=self.device), context, None)
 
     @torch.no_grad()
-    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def step(self, action: Tensor, state: State, context: Tensor | None = None) -> tuple[Tensor, State]:
         self.check_step(action, context)
-        last, hidden = state[:, : self.input_size], state[:, self.input_size :]
-        new = self._inputs(action, context, last)
-        logits, hidden = self.encode(new[:, None], None if self.window == 0 else hidden)
-        return logits[:, 0], torch.cat([new, hidden], 1)
+        last, hidden = state if self.takes_context else (None, state)
+        return self._read(action.long(), last if context is None else context, None if self.window == 0 else hidden)
 
-    def fixed_state(self, state: Tensor, steps: int) -> Tensor:
-        """`state [N, ...]` as `fixed_step` takes it, with room for so many more steps."""
-        return state
+    def _read(self, previous: Tensor, context: Tensor | None, hidden: State | None) -> tuple[Tensor, State]:
+        """Logits `[N, A]` after actions `previous [N]`, and the prior's state."""
+        given = None if context is None else context[:, None]
+        logits, hidden = self.encode(self._shown(previous)[:, None], given, hidden)
+        return logits[:, 0], (context, hidden) if self.takes_context else hidden
 
-    def fixed_step(self, action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """As `step`, in a state that keeps its shape; nothing that is done depends on a number on the device.
-
-        The state may be overwritten.
-        """
-        return self.step(action, state)
-
-    def draw_rest(self, action: Tensor, state: Tensor, uniform: Tensor, temperature: float) -> Tensor | None:
-        """The rest of many plans, drawn on a CUDA device by a recorded step; see `neuroprior.sampling.Steppable`.
-
-        If they have a context, it goes on.
-
-        Args:
-            action: integers `[N]`, the last ones.
-            state: before these.
-            uniform: `[T, N]`: what the next T actions are drawn with.
-            temperature: divides the logits.
-
-        Returns:
-            int64 `[N, T]`; None where recording does not pay, or does not work.
-        """
-        if state.device.type not in recordings.DEVICES or not self.is_plain:
-            return None
-        draw = Draw(self.num_actions, temperature, torch.Generator(state.device))
-
-        def take(last: Tensor, state: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
-            logits, state = self.fixed_step(last.clamp(min=0), state)
-            drawn, total = draw.drawn(logits, uniform)
-            return torch.where(total > 0, drawn, IMPOSSIBLE), state
-
-        key = temperature, repr(self.learned)
-        drawn = recordings.run_recorded(self, take, action, self.fixed_state(state, len(uniform)), [uniform], key)
-        if drawn is None:
-            return None
-        check_possible((drawn != IMPOSSIBLE).all())
-        return drawn.T
+    def _shown(self, previous: Tensor) -> Tensor:
+        """The actions before steps `[...]` as the network is shown them: with a window of 0, none."""
+        return torch.full_like(previous, self.num_actions) if self.window == 0 else previous
 
     @property
     def is_plain(self) -> bool:
-        """Whether it is of a class of this library, reads past actions, and is not hooked."""
+        """Whether it is of a class of this library, reads past actions, and has no hooks."""
         own = type(self).__module__.startswith(f"{__package__}.")
-        return own and self.window != 0 and not recordings.is_hooked(self)
+        hooks = (part._forward_hooks or part._forward_pre_hooks for part in self.modules())
+        return own and self.window != 0 and not any(hooks)
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         if plans.shape[1] == 0:
             return torch.zeros(*plans.shape, self.num_actions, device=self.device)
-        inputs = self._sequence(plans, context, None)
+        previous = self._previous(plans, None)
         if self.window == 0:  # each action is the first of a plan
-            return self.encode(inputs.flatten(0, 1)[:, None])[0].view(*plans.shape, self.num_actions)
-        return self.encode(inputs)[0]
+            given = None if context is None else context.flatten(0, 1)[:, None]
+            return self.encode(previous.flatten()[:, None], given)[0].view(*plans.shape, self.num_actions)
+        return self.encode(previous, context)[0]
 
     def forward_from(
         self,
         plans: Tensor,
         context: Tensor | None = None,
         previous: Tensor | None = None,
-        hidden: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]:
+        hidden: State | None = None,
+    ) -> tuple[Tensor, State]:
         """The logits of actions that continue a sequence; training in windows calls this.
 
         Args:
@@ -295,14 +257,14 @@ class NeuralPrior(Prior):
         Returns:
             Logits `[N, L, A]`, and `hidden` after these plans.
         """
-        return self.encode(self._sequence(plans, context, previous), hidden)
+        return self.encode(self._previous(plans, previous), context, hidden)
 
-    def _sequence(self, plans: Tensor, context: Tensor | None, previous: Tensor | None) -> Tensor:
-        """The inputs `[N, L, D]` that come before each action of `plans [N, L]`."""
+    def _previous(self, plans: Tensor, first: Tensor | None) -> Tensor:
+        """The action before each of `plans [N, L]`, int64; before the first, `first [N]` or none."""
         shifted = nn.functional.pad(plans.long(), (1, 0), value=self.num_actions)[:, :-1]
-        if previous is not None:
-            shifted = torch.cat([previous[:, None].long(), shifted[:, 1:]], 1)
-        return self._inputs(shifted, context, None)
+        if first is not None:
+            shifted = torch.cat([first[:, None].long(), shifted[:, 1:]], 1)
+        return self._shown(shifted)
 
     @property
     def fit_settings(self) -> tuple[str, ...]:
@@ -359,20 +321,6 @@ class NeuralPrior(Prior):
             self.window = longest - 1
         return plans
 
-    def _inputs(self, previous: Tensor, context: Tensor | None, last: Tensor | None) -> Tensor:
-        """Previous actions `[...]` and contexts as inputs `[..., D]`; context None: that of the `last` input."""
-        if self.window == 0:
-            previous = torch.full_like(previous, self.num_actions, dtype=torch.long)
-        action = previous[..., None].float()
-        if not self.takes_context:
-            return action
-        if context is None:
-            if last is None:
-                raise ValueError("context: this prior takes a context, and none was given")
-            return torch.cat([action, last[..., 1:]], -1)
-        values = context[..., None] if self.num_contexts is not None else context
-        return torch.cat([action, values.to(action)], -1)
-
 
 def training_settings() -> tuple[str, ...]:
     """The names of the settings that `fit` of every network takes."""
@@ -389,7 +337,7 @@ def context_embedding(num_contexts: int, width: int) -> nn.Embedding:
 
 
 class Embedding(nn.Module):
-    """Inputs `[N, T, D]` (previous action, context) to vectors `[N, T, width]`.
+    """Actions `[N, T]` and contexts `[N, T]` or `[N, T, C]` to vectors `[N, T, width]`.
 
     Each vector is the sum of an embedding of the previous action, of the context, and of a causal convolution over the
     last `lags` actions, each embedded in `LAG_WIDTH` numbers: what depends on the k-th last action can be read off
@@ -412,44 +360,45 @@ class Embedding(nn.Module):
         self.features = None if context_size is None else nn.Linear(context_size, width)
         self.scale = None if context_size is None else Standardise(context_size)
 
-    def forward(self, inputs: Tensor, recent: Tensor | None, window: int | None = None) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, previous: Tensor, context: Tensor | None, recent: Tensor | None, window: int | None = None
+    ) -> tuple[Tensor, Tensor]:
         """The vectors, and the last `lags` - 1 actions.
 
         Args:
-            inputs: see the class.
-            recent: `[N, lags - 1]`: the actions before these inputs; None: there were none.
+            previous, context: see `NeuralPrior.encode`.
+            recent: int64 `[N, lags - 1]`: the actions before these; None: there were none.
             window: past actions that were shown in training, at most. Lags further back have no weight: there the last
                 input of a plan's window is the start symbol, as it was in training.
         """
-        now = inputs[..., 0]
-        vectors: Tensor = self.action(now.long())
+        vectors: Tensor = self.action(previous)
         if recent is None:
-            recent = now.new_full((len(now), self.lags - 1), self.nothing)
-        line = torch.cat([recent.to(now), now], 1)
+            recent = previous.new_full((len(previous), self.lags - 1), self.nothing)
+        line = torch.cat([recent, previous], 1)
         if self.past is not None and self.mix is not None:
             taps = self.lags if window is None else min(window, self.lags)
             weight, beyond = self.mix.weight[..., self.lags - taps :], self.lags - taps
-            past = self.past(line[:, beyond:].long()).transpose(1, 2)
-            if now.shape[1] == 1:  # one output of a convolution is a product, which is quicker
+            past = self.past(line[:, beyond:]).transpose(1, 2)
+            if previous.shape[1] == 1:  # one output of a convolution is a product, which is quicker
                 vectors = vectors + nn.functional.linear(past.flatten(1), weight.flatten(1))[:, None]
             elif taps:
                 vectors = vectors + nn.functional.conv1d(past, weight).transpose(1, 2)
             if beyond:
                 start = self.mix.weight[..., beyond - 1] @ self.past.weight[self.nothing - 1]
-                begun = line[:, beyond - 1 : beyond - 1 + now.shape[1]] != self.nothing
+                begun = line[:, beyond - 1 : beyond - 1 + previous.shape[1]] != self.nothing
                 vectors = vectors + begun[..., None] * start
-        if self.index is not None or self.features is not None:
-            vectors = vectors + self.of_context(inputs)
+        if context is not None:
+            vectors = vectors + self.of_context(context)
         return vectors, line[:, line.shape[1] - self.lags + 1 :]
 
-    def of_context(self, inputs: Tensor) -> Tensor:
-        """What the contexts of `inputs [N, T, D]` add to their vectors: `[N, T, width]`."""
+    def of_context(self, context: Tensor) -> Tensor:
+        """What contexts `[N, T]` or `[N, T, C]` add to the vectors: `[N, T, width]`."""
         if self.index is not None:
-            given: Tensor = self.index(inputs[..., 1].long())
+            given: Tensor = self.index(context.long())
         else:
             assert self.features is not None
             assert self.scale is not None
-            given = self.features(self.scale(inputs[..., 1:]))
+            given = self.features(self.scale(context.to(self.features.weight.dtype)))
         return given
 
     def of_past(self, window: int | None) -> tuple[Tensor, Tensor]:

@@ -9,13 +9,7 @@ from torch.nn import functional
 from neuroprior._checks import check_memory, check_sizes
 from neuroprior.plans import Plans
 from neuroprior.priors.neural.neural import FEW, Embedding, NeuralPrior, Sizes
-from neuroprior.sampling.rows import extended, states_with_room
-
-ALIGNED = 8
-"""Numbers that lie together at an address that vector loads can read from."""
-
-ROOM = 16
-"""A state of a fixed size has room for a multiple of so many inputs, so that few sizes occur."""
+from neuroprior.sampling.states import State
 
 MANY_QUERIES = 1024
 """Plans whose single next query is answered faster by matrix products than by the fused kernels of a CUDA device, which
@@ -103,165 +97,39 @@ class TransformerPrior(NeuralPrior):
         self.norm = nn.LayerNorm(self.width)
         self.head = nn.Linear(self.width, self.num_actions)
 
-    def encode(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def encode(self, previous: Tensor, context: Tensor | None, hidden: State | None = None) -> tuple[Tensor, State]:
+        """See `NeuralPrior.encode`.
+
+        `hidden` is the key-value cache `[N, S, num_layers, 2 * width]`, from the oldest step on, and the last
+        `lags` - 1 actions.
+        """
         most = self.most_kept
-        if most is not None and inputs.shape[1] > max(most, FEWEST_AT_ONCE):
-            return self._encode_in_parts(inputs, hidden, max(most, FEWEST_AT_ONCE))
-        recent, past = (None, None) if hidden is None else self._unpacked(hidden)
-        x, recent = self.embedding(inputs, recent, self.window)
+        if most is not None and previous.shape[1] > max(most, FEWEST_AT_ONCE):
+            return self._encode_in_parts(previous, context, hidden, max(most, FEWEST_AT_ONCE))
+        past, recent = (None, None) if hidden is None else hidden
+        x, recent = self.embedding(previous, context, recent, self.window)
         x = self.drop(x)
         caches = []
         for layer, block in enumerate(self.blocks):
             x, cache = block(x, None if past is None else past[:, :, layer], self.span, self.window)
             caches.append(cache)
-        cache = torch.stack(caches, 2)
-        number = recent.new_full((len(cache), self.header - self.input_size - recent.shape[1]), cache.shape[1])
-        return self.head(self.norm(x)), torch.cat([recent, number, cache.flatten(1)], 1)
+        return self.head(self.norm(x)), (torch.stack(caches, 2), recent)
 
-    def _encode_in_parts(self, inputs: Tensor, hidden: Tensor | None, size: int) -> tuple[Tensor, Tensor]:
+    def _encode_in_parts(
+        self, previous: Tensor, context: Tensor | None, hidden: State | None, size: int
+    ) -> tuple[Tensor, State]:
         """As `encode`, part by part, since the cost of attention grows with the square of what is read at once."""
         logits = []
-        for part in inputs.split(size, 1):
-            out, hidden = self.encode(part, hidden)
+        for first in range(0, previous.shape[1], size):
+            now = slice(first, first + size)
+            out, hidden = self.encode(previous[:, now], None if context is None else context[:, now], hidden)
             logits.append(out)
-        assert hidden is not None
         return torch.cat(logits, 1), hidden
-
-    def _unpacked(self, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """The actions before, and the key-value cache `[N, S, num_layers, 2 * width]` from the oldest input on.
-
-        Its keys are at the positions 0 to S - 1, as those that are read at once.
-        """
-        cache = hidden[:, self.header - self.input_size :].unflatten(1, (-1, self.num_layers, 2 * self.width))
-        kept, number = cache.shape[1], self._number(hidden)
-        if number > kept:
-            first = 0 if self.window is None else 1  # the start symbol stays where it is
-            turned = torch.roll(cache[:, first:], -((number - first) % (kept - first)), 1)
-            key, value = torch.cat([cache[:, :first], turned], 1).chunk(2, -1)
-            back = rotation(torch.tensor([kept - number], device=cache.device), self.width // self.num_heads)
-            cache = torch.cat([rotate(key.flatten(1, 2), *back).view(key.shape), value], -1)
-        return hidden[:, : self.lags - 1], cache
-
-    def _number(self, hidden: Tensor) -> int:
-        """How many inputs were read before; the position of the next one."""
-        kept = (hidden.shape[1] + self.input_size - self.header) // self.cache_size
-        full = kept == self.most_kept and len(hidden) > 0
-        return int(hidden[0, self.lags - 1]) if full else kept
 
     @property
     def most_kept(self) -> int | None:
-        """At most so many inputs are kept in the key-value cache; if None, no limit."""
-        return self.window + 1 if self.window is not None else None if self.span is None else self.span + 1
-
-    @property
-    def header(self) -> int:
-        """How many numbers of a state lie before the key-value cache.
-
-        They are the last input, the actions before it, and how many inputs there were; this fills up the rest, so that
-        keys and values lie where kernels of a CUDA device can read them.
-        """
-        return -(-(self.input_size + self.lags) // ALIGNED) * ALIGNED
-
-    @property
-    def cache_size(self) -> int:
-        """Numbers of the key-value cache for each input."""
-        return self.num_layers * 2 * self.width
-
-    @torch.no_grad()
-    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        if not self.writes_in_place(state):
-            return super().step(action, state, context)
-        self.check_step(action, context)
-        return self._step_in_place(action, state, context)
-
-    @torch.no_grad()
-    def advance(
-        self, action: Tensor, state: Tensor, context: Tensor | None = None, room: int = 0
-    ) -> tuple[Tensor, Tensor]:
-        if not self.writes_in_place(state) or type(self).step is not TransformerPrior.step:
-            return self.step(action, state, context)
-        return self._step_in_place(action, state, context, room)
-
-    def _step_in_place(
-        self, action: Tensor, state: Tensor, context: Tensor | None, room: int | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """A step in which new keys and values are written behind the cache, which is the largest part of the state.
-
-        Where the cache is full they are written over the oldest.
-
-        Args:
-            action, state, context: see `step`.
-            room: None: the cache is copied once, and `state` stays as it is. Otherwise a state that has room is
-                overwritten, and any other is copied to a tensor with room for so many further steps.
-        """
-        given, recent, header, most = self.input_size, self.input_size + self.lags - 1, self.header, self.most_kept
-        number, kept = self._number(state[:, given:]), (state.shape[1] - header) // self.cache_size
-        new = self._inputs(action, context, state[:, :given])
-        x, line = self.embedding(new[:, None], state[:, given:recent], self.window)
-        grown = kept if kept == most else kept + 1
-        size = header + grown * self.cache_size
-        after = None if room is None else extended(state, size)
-        if after is None:
-            more = 0 if room is None else room if most is None else min(room, most - grown)
-            after = states_with_room(state, size, more * self.cache_size)
-            after[:, header : state.shape[1]] = state[:, header:]
-        after[:, :given], after[:, given:recent], after[:, recent:header] = new, line, number + 1
-        cache = after[:, header:].unflatten(1, (grown, self.num_layers, -1))
-        first = 0 if self.window is None else 1
-        place = number if number < grown else first + (number - first) % (grown - first)
-        if self.window is not None and number > self.window:
-            self._keep_distance(cache, torch.tensor([1], device=state.device))
-        here = torch.tensor([number], device=state.device)
-        return self._read(x, cache, here, slice(place, place + 1), None), after
-
-    def fixed_state(self, state: Tensor, steps: int) -> Tensor:
-        kept, most = (state.shape[1] - self.header) // self.cache_size, self.most_kept
-        slots = -(-(kept + steps) // ROOM) * ROOM
-        slots = slots if most is None else min(slots, most)
-        return functional.pad(state, (0, (slots - kept) * self.cache_size))
-
-    def fixed_step(self, action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        given, recent, header = self.input_size, self.input_size + self.lags - 1, self.header
-        cache = state[:, header:].unflatten(1, (-1, self.num_layers, 2 * self.width))
-        number, slots = state[0, recent : recent + 1].long(), cache.shape[1]
-        new = self._inputs(action, None, state[:, :given])
-        x, line = self.embedding(new[:, None], state[:, given:recent], self.window)
-        state[:, :given], state[:, given:recent], state[:, recent:header] = new, line, number + 1
-        first = 0 if self.window is None else 1
-        place = torch.where(number < slots, number, first + (number - first) % max(slots - first, 1))
-        if self.window is not None:
-            self._keep_distance(cache, (number > self.window).long())
-        filled = torch.arange(slots, device=state.device) <= number
-        return self._read(x, cache, number, place, filled[None]), state
-
-    def _keep_distance(self, cache: Tensor, steps: Tensor) -> None:
-        """Turn the start symbol's keys in `cache [N, S, num_layers, 2 * width]` by so many `steps [1]`."""
-        key = cache[:, 0, :, : self.width]
-        key.copy_(rotate(key, *rotation(steps, self.width // self.num_heads)))
-
-    def _read(self, x: Tensor, cache: Tensor, number: Tensor, place: slice | Tensor, filled: Tensor | None) -> Tensor:
-        """The logits `[N, A]` after one more input.
-
-        Args:
-            x: `[N, 1, width]`, its vectors.
-            cache: `[N, S, num_layers, 2 * width]`, in which its keys and values are written to this `place`.
-            number: `[1]`, its position.
-            filled: bool `[1, S]`: the places that are attended to; None: all.
-        """
-        turns = rotation(number, self.width // self.num_heads)
-        for layer, block in enumerate(self.blocks):
-            assert isinstance(block, Block)
-            x = block.step(x, cache[:, :, layer], place, turns, filled)
-        logits: Tensor = self.head(self.norm(x))
-        return logits[:, 0]
-
-    def writes_in_place(self, state: Tensor) -> bool:
-        """Whether the next step may be written in place.
-
-        In training, under autocast, and in subclasses with an `encode` of their own it is not.
-        """
-        plain = type(self).encode is TransformerPrior.encode and not (self.training or torch.is_grad_enabled())
-        return plain and self.window != 0 and not torch.is_autocast_enabled(state.device.type)
+        """At most so many steps are kept in the key-value cache; if None, no limit."""
+        return self.span if self.window is None else self.window + 1
 
 
 class Block(nn.Module):
@@ -283,45 +151,30 @@ class Block(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """`x [N, T, width]` after `past [N, S, 2 * width]`: the new `x`, and the keys and values to be kept.
 
-        Each input attends to itself and those before it, at most `span` back. Positions count from the first input of
-        the past; where the oldest ones are dropped, the keys that are kept are rotated back by as many positions.
-
-        With a `window`, each input attends to the first one and to the last `window`, itself among them; the first is
-        never further away than `window`, and is kept.
+        Each step attends to itself and those before it, at most `span` back. With a `window`, each attends to the
+        first one and to the last `window`, itself among them; the first is never further away than `window`, and is
+        kept. Keys are kept as they are, and rotated by their places among those that are kept when they are read: so
+        the distances are right whichever were dropped before.
         """
         start, size = 0 if past is None else past.shape[1], x.shape[-1] // self.num_heads
-        place = torch.arange(start, start + x.shape[1], device=x.device)
-        turns = rotation(place, size)
-        unturned, key, value = self._project(x)
-        query, key = rotate(unturned, *turns), rotate(key, *turns)
+        query, key, value = self._project(x)
         if past is not None:
             # under autocast new keys and values may be of another dtype than kept ones
             key, value = torch.cat([past.to(key.dtype), torch.cat([key, value], -1)], 1).chunk(2, -1)
+        place = torch.arange(key.shape[1], device=x.device)
+        turned, turned_key = rotate(query, *rotation(place[start:], size)), rotate(key, *rotation(place, size))
         if window is None or key.shape[1] <= window + 1:
-            mixed = self._attend(query, key, value, span)
+            mixed = self._attend(turned, turned_key, value, span)
         else:
-            near = rotate(unturned, *rotation(place.clamp(max=window), size))
-            mixed = self._attend_to_first(query, near, key, value, window)
-        x = self._add(x, mixed)
+            near = rotate(query, *rotation(place[start:].clamp(max=window), size))
+            mixed = self._attend_to_first(turned, near, turned_key, value, window)
         most = span if window is None else window + 1
         excess = 0 if most is None else max(key.shape[1] - most, 0)
+        kept = torch.cat([key, value], -1)
         if excess:
-            first, back = (0 if window is None else 1), rotation(place.new_tensor([-excess]), size)
-            key = torch.cat([key[:, :first], rotate(key[:, first + excess :], *back)], 1)
-            value = torch.cat([value[:, :first], value[:, first + excess :]], 1)
-        return x, torch.cat([key, value], -1)
-
-    def step(
-        self, x: Tensor, cache: Tensor, place: slice | Tensor, turns: tuple[Tensor, Tensor], filled: Tensor | None
-    ) -> Tensor:
-        """The new `x [N, 1, width]`; keys and values are written to this place of `cache [N, S, 2 * width]`.
-
-        `turns`: the rotation of the input's position; `filled`: see `TransformerPrior`.
-        """
-        query, key, value = self._project(x)
-        cache[:, place] = torch.cat([rotate(key, *turns), value], -1)
-        key, value = cache.chunk(2, -1)
-        return self._add(x, self._attend(rotate(query, *turns), key, value, None, filled))
+            first = 0 if window is None else 1
+            kept = torch.cat([kept[:, :first], kept[:, first + excess :]], 1)
+        return self._add(x, mixed), kept
 
     def _project(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Queries, keys and values of `x [N, T, width]`."""
@@ -334,15 +187,13 @@ class Block(nn.Module):
         added: Tensor = self.drop(self.mlp(x))
         return x + added
 
-    def _attend(
-        self, query: Tensor, key: Tensor, value: Tensor, span: int | None, filled: Tensor | None = None
-    ) -> Tensor:
-        """`[N, T, width]`: attention of each query over keys and values `[N, S + T, width]`, or those `filled`."""
+    def _attend(self, query: Tensor, key: Tensor, value: Tensor, span: int | None) -> Tensor:
+        """`[N, T, width]`: attention of each query over keys and values `[N, S + T, width]`."""
         num, total = query.shape[1], key.shape[1]
         span = total if span is None else span
         every = total <= span + 1
         plain = num == total and every
-        mask = filled if plain or (num == 1 and every) else reached(num, total, span, query.device)
+        mask = None if plain or (num == 1 and every) else reached(num, total, span, query.device)
         query, key, value = (self._heads(one).to(value.dtype) for one in (query, key, value))
         if num == 1 and query.is_cuda and len(query) >= MANY_QUERIES:
             scores = query @ key.mT / query.shape[-1] ** 0.5

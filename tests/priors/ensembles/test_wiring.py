@@ -310,8 +310,9 @@ def test_in_training_outputs_of_a_stacked_prior_are_dropped_too():
             weight.fill_(1.0 if "bias" in name else 0.0)
         prior.mixer.head.weight.fill_(1.0)
         prior.mixer.head.weight[0] = 0
-        inputs = torch.zeros(1, 20, 1 + prior.mixer.num_experts * A)
+        previous = torch.zeros(1, 20, dtype=torch.int64)
+        forecasts = torch.zeros(1, 20, prior.mixer.num_experts * A)
         for training in (True, False):
             prior.mixer.train(training)
-            first, second = (prior.mixer.encode(inputs)[0] for _ in range(2))
+            first, second = (prior.mixer.encode(previous, forecasts)[0] for _ in range(2))
             assert first.equal(second) != training

@@ -10,6 +10,7 @@ import torch
 from neuroprior import GRUPrior, Plans, TransformerPrior, load, save
 from neuroprior.plans import expand_context
 from neuroprior.priors.neural import gru
+from neuroprior.sampling.states import map_state, tensors_in
 from tests.support.sources import best_plan_distribution, best_plans, bits_per_action, every_plan, refuses, seeded
 
 BOTH = pytest.mark.parametrize("kind", [GRUPrior, TransformerPrior])
@@ -195,8 +196,8 @@ def test_single_steps_of_a_gru_are_those_of_torch(batch, lags, num_layers, takes
     features = torch.rand(batch, 2, generator=seeded(1)).to(dtype)
     context = {"num_contexts": torch.arange(batch) % 3, "context_size": features}
     current = next((context[name] for name in takes), None)
-    one_step, calls = prior._one_step, []
-    monkeypatch.setattr(prior, "_one_step", lambda *given: calls.append(given) or one_step(*given))
+    one_step, calls = gru.gru_step, []
+    monkeypatch.setattr(gru, "gru_step", lambda *given, **rows: calls.append(given) or one_step(*given, **rows))
 
     def steps():
         logits, state = prior.start(batch, current)
@@ -204,19 +205,18 @@ def test_single_steps_of_a_gru_are_those_of_torch(batch, lags, num_layers, takes
         for one in action:
             logits, state = prior.step(one, state)
             predicted.append(logits)
-        return torch.stack(predicted), state
+        return torch.stack(predicted)
 
     fast = steps()
     assert len(calls) == len(action)
-    assert not fast[0].requires_grad
+    assert not fast.requires_grad
     with torch.autocast("cpu", torch.bfloat16):
         rough = steps()
-    monkeypatch.setattr(prior, "_may_step", lambda inputs: False)
-    plain = steps()
     assert len(calls) == len(action)
-    for one, other, third in zip(fast, plain, rough, strict=True):
-        torch.testing.assert_close(one, other, atol=1e-6, rtol=1e-5)
-        torch.testing.assert_close(third.to(one), one, atol=0.05, rtol=0.05)
+    throughout = None if current is None else expand_context(current, len(action) + 1)
+    whole = prior(torch.cat([action, action[:1]]).T, throughout).transpose(0, 1)
+    torch.testing.assert_close(fast, whole, atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(rough.to(fast), fast, atol=0.05, rtol=0.05)
 
 
 @pytest.mark.parametrize("num_layers", [1, 2])
@@ -305,38 +305,25 @@ def test_steps_are_those_of_torch_over_the_whole_range_of_activations(layers, nu
 @pytest.mark.parametrize("lags", [1, 3])
 @pytest.mark.parametrize(("window", "span"), [(None, None), (1, None), (4, None), (9, None), (None, 3), (None, 1)])
 @pytest.mark.parametrize("takes", [{}, {"num_contexts": 3}, {"context_size": 2}])
-def test_single_steps_of_a_transformer_are_those_of_its_blocks(lags, window, span, takes, monkeypatch):
-    """Without gradients a step writes to a copy of the cache, over the oldest input past a window or span."""
+def test_steps_of_a_transformer_are_what_it_reads_at_once(lags, window, span, takes):
+    """Also where the cache is full, and steps are dropped from it; a step leaves the state before it as it was."""
     prior = TransformerPrior(4, width=8, num_heads=2, window=window, lags=lags, dropout=0.3, seed=1, **takes)
     prior.span, batch = span, 3
     action = torch.randint(4, (13, batch), generator=seeded(0))
     context = {"num_contexts": torch.arange(batch), "context_size": torch.rand(batch, 2, generator=seeded(1))}
     current = next((context[name] for name in takes), None)
-
-    def steps(step, in_place):
-        logits, state = prior.start(batch, current)
-        predicted = [logits]
-        for t, one in enumerate(action):
-            with monkeypatch.context() as patched:
-                if not in_place(t):
-                    patched.setattr(prior, "writes_in_place", lambda state: False)
-                logits, state = step(one, state)
-            predicted.append(logits)
-        return torch.stack(predicted), state
-
-    with torch.no_grad():
-        fast = steps(prior.step, lambda t: True)
-        written_over = steps(lambda one, state: prior.advance(one, state, None, len(action)), lambda t: True)
-        by_turns = steps(prior.step, lambda t: t % 3 == 0)
-        plain = steps(prior.step, lambda t: False)
-    for one, other, third in zip(fast, plain, written_over, strict=True):
-        assert torch.equal(one, third)
-        if one is fast[0] or window is span is None:
-            torch.testing.assert_close(one, other.detach(), atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(by_turns[0].detach(), fast[0], atol=1e-5, rtol=1e-4)
+    logits, state = prior.start(batch, current)
+    predicted = [logits]
+    for one in action:
+        before = map_state(torch.clone, state)
+        logits, after = prior.step(one, state)
+        assert all(map(torch.equal, tensors_in(before), tensors_in(state)))
+        predicted, state = [*predicted, logits], after
     throughout = None if current is None else expand_context(current, len(action) + 1)
     whole = prior(torch.cat([action, action[:1]]).T, throughout).detach().transpose(0, 1)
-    torch.testing.assert_close(whole, fast[0], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(whole, torch.stack(predicted), atol=1e-5, rtol=1e-4)
+    cache = (state[1] if takes else state)[0]
+    assert cache.shape[1] == min(14, prior.most_kept or 14)
 
 
 def test_no_plans_at_all():
@@ -344,42 +331,8 @@ def test_no_plans_at_all():
     with torch.no_grad():
         _, state = prior.start(0)
         for _ in range(3):
-            logits, state = prior.advance(torch.zeros(0, dtype=torch.long), state, None, 2)
+            logits, state = prior.step(torch.zeros(0, dtype=torch.long), state)
     assert logits.shape == (0, 4)
-
-
-def test_a_transformer_that_advances_allocates_memory_once():
-    """A step leaves the state as it was; to advance takes room for all further steps, and then writes there."""
-    prior = TransformerPrior(4, width=8, num_heads=2, window=9)
-    with torch.no_grad():
-        _, state = prior.start(3)
-        whole = state.clone()
-        _, after = prior.step(torch.tensor([0, 1, 2]), state)
-        assert torch.equal(state, whole)
-        _, first = prior.advance(torch.tensor([0, 1, 2]), state, None, 2)
-        assert torch.equal(first, after)
-        places = {first.data_ptr()}
-        for _ in range(2):
-            _, first = prior.advance(torch.tensor([3, 1, 0]), first, None, 0)
-            places.add(first.data_ptr())
-        assert len(places) == 1
-        _, more = prior.advance(torch.tensor([3, 1, 0]), first, None, 6)
-        assert more.data_ptr() not in places
-        sizes = set()
-        for _ in range(9):  # past the window nothing is added
-            _, again = prior.advance(torch.tensor([3, 1, 0]), more, None, 0)
-            sizes.add((more := again).untyped_storage().data_ptr())
-        assert len(sizes) == 1
-
-
-def test_a_transformer_in_training_or_in_rough_numbers_does_not_write_in_place():
-    prior = TransformerPrior(4, width=8, num_heads=2)
-    with torch.no_grad():
-        _, state = prior.start(3)
-        assert prior.writes_in_place(state)
-        with torch.autocast("cpu", torch.bfloat16):
-            assert not prior.writes_in_place(state)
-        assert not prior.train().writes_in_place(state)
 
 
 class NeverFirst(TransformerPrior):
@@ -393,8 +346,8 @@ class NeverFirst(TransformerPrior):
 class Loud(TransformerPrior):
     """Reads in a way of its own."""
 
-    def encode(self, inputs, hidden=None):
-        logits, hidden = super().encode(inputs, hidden)
+    def encode(self, previous, context, hidden=None):
+        logits, hidden = super().encode(previous, context, hidden)
         return 2 * logits + 1, hidden
 
 
@@ -404,38 +357,10 @@ def test_subclasses_that_step_or_read_in_their_own_way_do(kind):
     with torch.no_grad():
         _, state = prior.start(4)
         action = torch.tensor([0, 1, 2, 0])
-        want = kind.encode(prior, action[:, None, None].float(), state[:, 1:])[0][:, 0]
-        for logits, _ in (prior.step(action, state), prior.advance(action, state, None, 3)):
-            assert torch.allclose(logits[:, 1:], want[:, 1:], atol=1e-5)
-            assert (logits[:, 0] == -torch.inf).all() == (kind is NeverFirst)
-
-
-@pytest.mark.parametrize("part", [slice(None, None, 2), slice(1, None, 2), slice(0, 2), slice(3, None)])
-def test_a_state_that_is_part_of_another_tensor_is_not_written_over(part):
-    """Rows of a state that has room, and columns of a tensor that holds others."""
-    prior = TransformerPrior(4, width=8, num_heads=2)
-    with torch.no_grad():
-        _, state = prior.start(6)
-        action = torch.tensor([0, 1, 2, 3, 0, 1])
-        _, roomy = prior.advance(action, state, None, 5)
-        kept = roomy.clone()
-        want, _ = prior.step(action[part], roomy[part])
-        got, _ = prior.advance(action[part], roomy[part], None, 3)
-        assert torch.equal(got, want)
-        assert torch.equal(roomy, kept)
-        beside = torch.cat([kept, torch.ones(6, 500)], 1)
-        prior.advance(action, beside[:, : kept.shape[1]], None, 0)
-        assert (beside[:, kept.shape[1] :] == 1).all()
-
-
-@pytest.mark.parametrize(("window", "span"), [(5, None), (None, 6)])
-def test_no_more_room_is_taken_than_is_used(window, span):
-    prior = TransformerPrior(4, width=8, num_heads=2, window=window)
-    prior.span = span
-    with torch.no_grad():
-        _, state = prior.start(2)
-        _, state = prior.advance(torch.tensor([0, 1]), state, None, 10**6)
-    assert state.untyped_storage().nbytes() < 2 * 4 * 12 * (prior.cache_size + prior.lags + 1)
+        want = kind.encode(prior, action[:, None], None, state)[0][:, 0]
+        logits, _ = prior.step(action, state)
+        assert torch.allclose(logits[:, 1:], want[:, 1:], atol=1e-5)
+        assert (logits[:, 0] == -torch.inf).all() == (kind is NeverFirst)
 
 
 @BOTH
