@@ -4,7 +4,6 @@ from neuroprior.priors.counts import ContextTreePrior, Leaf, MarkovPrior
 from neuroprior.priors.ensembles import CombinedPrior, MixturePrior, StackedPrior
 from neuroprior.priors.fitting import fit
 from neuroprior.priors.intentions import Posterior, forecast, infer
-from neuroprior.priors.macros import Macro, MacroPrior, learn_macros
 from neuroprior.priors.matching import decode, match_plans
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
 from neuroprior.priors.prior import Prior
@@ -20,8 +19,6 @@ __all__ = [
     "ContextTreePrior",
     "GRUPrior",
     "Leaf",
-    "Macro",
-    "MacroPrior",
     "MarkovPrior",
     "MixturePrior",
     "ModePosterior",
@@ -32,7 +29,6 @@ __all__ = [
     "UniformPrior",
     "decode",
     "fit",
-    "learn_macros",
     "load",
     "match_plans",
     "save",

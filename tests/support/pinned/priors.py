@@ -18,7 +18,6 @@ from neuroprior.plans import Plans
 from neuroprior.priors import (
     CombinedPrior,
     GRUPrior,
-    MacroPrior,
     MarkovPrior,
     MixturePrior,
     Prior,
@@ -27,10 +26,8 @@ from neuroprior.priors import (
     TransformerPrior,
     decode,
     fit,
-    learn_macros,
 )
 from neuroprior.priors.fitting import PRIORS
-from neuroprior.priors.macros import CRITERIA
 from neuroprior.puzzles import LogLinearPrior, Steps
 from neuroprior.sampling.states import tensors_in
 from tests.support.pinned.data import behaviour, timed
@@ -153,16 +150,6 @@ def durations():
         }
     found["chosen"] = DurationModel(3).fit(timed(80, 30)).table()
     return found
-
-
-@case
-def macros():
-    plans, found = behaviour(30), {}
-    for by in CRITERIA:
-        learned, recoded = learn_macros(plans, 3, by)
-        found[by] = [learned, recoded.actions, recoded.lengths, recoded.num_actions, recoded.action_names]
-    prior = MacroPrior(3, MarkovPrior(5, 1), "compression").fit(plans)
-    return found | {"prior": of_prior(prior, plans)}
 
 
 @case(relative=2e-3)
