@@ -3,7 +3,7 @@
 from neuroprior.priors.counts import ContextTreePrior, Leaf, MarkovPrior
 from neuroprior.priors.ensembles import CombinedPrior, MixturePrior, StackedPrior
 from neuroprior.priors.fitting import fit
-from neuroprior.priors.intentions import Posterior, forecast, infer
+from neuroprior.priors.intentions import Posterior, infer
 from neuroprior.priors.matching import decode, match_plans
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
 from neuroprior.priors.prior import Prior
@@ -13,7 +13,6 @@ from neuroprior.priors.uniform import UniformPrior
 
 __all__ = [
     "Posterior",
-    "forecast",
     "infer",
     "CombinedPrior",
     "ContextTreePrior",
