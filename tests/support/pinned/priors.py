@@ -9,7 +9,6 @@ from neuroprior.behaviour import LAW_NAMES, DurationModel, SemiMarkovPrior
 from neuroprior.control import (
     AutoregressivePrior,
     NoisePrior,
-    StepSynergies,
     StoredWindows,
     VectorGRU,
     VectorPlans,
@@ -242,7 +241,6 @@ def priors_of_vectors():
         ("white", NoisePrior(*ends), {}),
         ("coloured", NoisePrior(*ends, None, memory=5), {}),
         ("autoregressive", AutoregressivePrior(*ends), {}),
-        ("synergies", StepSynergies(*ends, 1), {}),
         ("stored", StoredWindows(*ends, match=2, horizon=4, max_windows=20), {}),
         ("gru", VectorGRU(*ends, width=8, num_components=2), few),
         ("gru, context", VectorGRU(*ends, 1, width=8, num_layers=2), few),
