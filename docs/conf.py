@@ -73,7 +73,6 @@ ROOMS = {
     "neuroprior.priors": "Priors",
     "neuroprior.priors.counts": "Priors that count",
     "neuroprior.priors.ensembles": "Priors made of priors",
-    "neuroprior.priors.macros": "Macro-actions",
     "neuroprior.priors.neural": "Neural priors",
     "neuroprior.priors.switching": "Priors with hidden modes",
     "neuroprior.sampling": "Sampling",

@@ -12,6 +12,12 @@ from typing import IO, Any
 
 from neuroprior._version import __version__
 
+MISSING_LABELS = (
+    "", "nan", "na", "n/a", "n.a.", "<na>", "null", "?", "-", "#n/a", "#value!", "#ref!", "#name?", "#div/0!",
+    "#num!",
+)  # fmt: skip
+"""What stands for no label in tables, in lower case."""
+
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write an object as JSON; numbers that are not finite, which JSON does not have, become null."""

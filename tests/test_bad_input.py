@@ -30,7 +30,7 @@ from neuroprior.behaviour.report.plan_report import report
 from neuroprior.control import ICEMPlanner, PlanarArm, control
 from neuroprior.planners import FrontierPlanner, expected_score
 from neuroprior.plans import folds
-from neuroprior.priors import CombinedPrior, MixturePrior, learn_macros
+from neuroprior.priors import CombinedPrior, MixturePrior
 from neuroprior.priors.scoring import score
 from neuroprior.worlds import cube
 from tests.support.sources import refuses, seeded
@@ -128,7 +128,6 @@ FITTED = {"a": UniformPrior(2)}
         (lambda: fit(PLANS, None), ["prior", "a class", "None"]),
         (lambda: CombinedPrior(2, ["gru"]), ["must be a prior", "'gru'"]),
         (lambda: MixturePrior(2, [MarkovPrior]), ["must be a prior", "MarkovPrior"]),
-        (lambda: learn_macros(ACTIONS, 2), ["plans", "Tensor"]),
         (lambda: folds(None, 2), ["plans", "NoneType"]),
         (lambda: analysis.transitions(ACTIONS), ["plans", "Tensor"]),
         (lambda: analysis.motifs([[0, 1]]), ["plans", "list"]),

@@ -34,7 +34,6 @@ from neuroprior.control import (
     NoisePrior,
     PlanarArm,
     ShootingPlanner,
-    StepSynergies,
     StoredWindows,
     VectorGRU,
     VectorPlans,
@@ -224,7 +223,6 @@ VECTORS: dict[str, Callable[..., VectorPrior]] = {
     "noise": NoisePrior,
     "coloured": partial(NoisePrior, exponent=None, memory=4),
     "autoregressive": AutoregressivePrior,
-    "synergies": StepSynergies,
     "stored": partial(StoredWindows, match=2, horizon=4, max_windows=10),
     "gru": partial(VectorGRU, width=8),
 }

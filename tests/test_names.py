@@ -18,7 +18,7 @@ from neuroprior.control import (
     VectorPrior,
     control,
 )
-from neuroprior.priors import MixturePrior, StackedPrior, forecast, infer
+from neuroprior.priors import MixturePrior, StackedPrior, infer
 from neuroprior.sampling import sample_in_world
 from neuroprior.worlds import gridworld
 
@@ -153,18 +153,6 @@ def test_named_plans_are_matched_to_each_intention():
     one, other = learned(PLANS), learned(replace(PLANS, actions=3 - PLANS.actions, action_names=NAMES[::-1]))
     found = infer([one, other], PLANS)
     assert found.log_probs[:, -1].exp().allclose(torch.full((20, 2), 0.5, dtype=torch.double))
-
-
-def test_a_forecast_is_of_the_priors_that_were_inferred():
-    priors = {"a": learned(PLANS), "b": UniformPrior(4)}
-    posterior = infer(priors, PLANS[:2])
-    state, targets = torch.tensor([0, 5]), torch.tensor([1])
-    assert forecast(priors, WORLD, state, posterior, 2, 5, targets=targets).shape == (2, 1)
-    with pytest.raises(ValueError, match=r"^`posterior` must be that of the priors b, a"):
-        forecast(dict(reversed(priors.items())), WORLD, state, posterior, 2, 5, targets=targets)
-    for wrong in (16, -1):
-        with pytest.raises(ValueError, match=f"{wrong} is out of range"):
-            forecast(priors, WORLD, state, posterior, 2, 5, targets=torch.tensor([wrong]))
 
 
 def test_a_fit_that_is_refused_leaves_a_network_free_to_learn_other_plans():

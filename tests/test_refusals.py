@@ -19,7 +19,7 @@ from neuroprior.control import (
     vector_plans_from_trajectories,
     write_vector_plans,
 )
-from neuroprior.priors import MixturePrior, StackedPrior, SwitchingPrior, forecast, infer, load, save
+from neuroprior.priors import MixturePrior, StackedPrior, SwitchingPrior, infer, load, save
 from neuroprior.puzzles import LogLinearPrior, SokobanWorld, Steps, read_sokoban, sliding_tiles, sokoban
 from neuroprior.worlds import cube, gridworld
 from tests.support.sources import refuses, seeded
@@ -64,12 +64,6 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "levels of no width": (lambda: SokobanWorld(torch.zeros(0, 3, 3), ()), "levels"),
     "a prior that is none": (lambda: infer({"a": 3}, ZEROS), "priors['a']"),
-    "what no prior allows": (
-        lambda: forecast(
-            [UniformPrior(4)], gridworld(3, 3), ZEROS[0, :1], torch.ones(1, 1) * 2, 1, 2, targets=ZEROS[0]
-        ),
-        "sum to 1",
-    ),
     "a state that is no tensor": (lambda: DoubleIntegrator().rollout(3, VECTORS), "state"),
     "a state of other shape": (lambda: DoubleIntegrator().rollout(torch.zeros(2, 3), torch.zeros(2, 1, 3, 2)), "state"),
     "a table that is too large": (

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import torch
 
-from eval.compare.priors import load_for, make_macro
+from eval.compare.priors import load_for
+from eval.worlds.macros import MacroPrior
 from eval.worlds.runs import check_distinct
 from neuroprior import World, compare
 from neuroprior.comparison.contestants import PLANNERS, PriorSource
@@ -52,7 +53,7 @@ def compare_in(
     check_distinct(num_plans=num_plans, planners=names)
     where = load_world(world)
     fitted = tuple(() if priors else KINDS) if kinds is None else tuple(kinds)
-    sources: dict[str, PriorSource] = {kind: make_macro if kind == "macro" else kind for kind in fitted}
+    sources: dict[str, PriorSource] = {kind: MacroPrior if kind == "macro" else kind for kind in fitted}
     saved = {folder: load_for(folder, world, where.num_actions, where.action_names) for folder in priors}
     comparison = compare(
         where,

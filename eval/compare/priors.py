@@ -12,7 +12,6 @@ from torch import Tensor
 from eval.worlds.contexts import ContextIndex
 from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, Prior, TabularWorld, TransformerPrior, World, load
 from neuroprior.behaviour.analysis.comparison import score
-from neuroprior.priors import MacroPrior
 from neuroprior.priors.learning import plans_for, training_plans
 from neuroprior.priors.matching import numbers
 
@@ -21,9 +20,6 @@ ORDERS = range(5)
 
 COMBINED = "combined"
 """The label of the combined prior."""
-
-MACROS, MACRO_ORDER = 16, 2
-"""Number of macro-actions, and the order of the chain over actions and macro-actions."""
 
 
 NEURAL: dict[str, Callable[..., Prior]] = {"gru": GRUPrior, "transformer": TransformerPrior}
@@ -50,11 +46,6 @@ def chain(order: int, world: World, plans: Plans, feature_sets: Sequence[tuple[i
     if sizes:
         return ContextMarkov(plans.num_actions, order, feature_sets, **sizes)
     return MarkovPrior(plans.num_actions, order)
-
-
-def make_macro(num_actions: int) -> MacroPrior:
-    """A chain over actions and macro-actions."""
-    return MacroPrior(num_actions, MarkovPrior(num_actions + MACROS, MACRO_ORDER))
 
 
 def network(kind: str, world: World, plans: Plans, seed: int) -> Prior:

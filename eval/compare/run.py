@@ -25,9 +25,9 @@ from eval.compare.priors import (
     combined,
     digests,
     load_for,
-    make_macro,
     network,
 )
+from eval.worlds.macros import MacroPrior
 from eval.worlds.runs import Run
 from eval.worlds.starts import Starts, starts_of
 from eval.worlds.suite import TASKS, Context, Task
@@ -215,7 +215,7 @@ class Contest:
             prior = combined(world, first, self.task.feature_sets, draw_seed(self.generator))
             yield from self._curriculum(COMBINED, context, prior, first, **training)
         if "macro" in kinds and context == "none":
-            yield from self._curriculum("macro", context, make_macro(first.num_actions), first)
+            yield from self._curriculum("macro", context, MacroPrior(first.num_actions), first)
 
     def _curriculum(
         self, label: str, context: Context, prior: Prior, first: Plans, **training: Any

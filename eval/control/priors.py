@@ -7,10 +7,10 @@ from typing import Literal, TypeAlias
 
 import torch
 
+from eval.control.synergies import StepSynergies
 from neuroprior.control import (
     AutoregressivePrior,
     NoisePrior,
-    StepSynergies,
     StoredWindows,
     VectorGRU,
     VectorPlans,

@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from eval.intentions.calibration import count_forecasts
+from eval.intentions.forecast import forecast
 from eval.worlds.labyrinth import data_digest
 from neuroprior import MarkovPrior, Plans, Prior, TabularWorld
 from neuroprior._random import draw_seed
 from neuroprior.planners import value_iteration
-from neuroprior.priors import forecast, infer
+from neuroprior.priors import infer
 from neuroprior.priors.counts import Chains
 from neuroprior.worlds import four_rooms, maze
 from neuroprior.worlds.grid import GridWorld
@@ -272,9 +273,7 @@ def _forecasts(
         found = {Key("exact", 0): exact, Key("uniform", 0): torch.full_like(exact, 1 / size)}
         for key, own in priors.items():
             share, seen = torch.zeros_like(exact), posteriors[key]
-            share[:, scene.free] = forecast(
-                own, scene.world, now, seen, ahead, SAMPLES, targets=scene.free, generator=generator
-            )
+            share[:, scene.free] = forecast(own, scene.world, now, seen, ahead, SAMPLES, scene.free, generator)
             name = key._replace(kind="exact, sampled") if key.kind == "exact" else key
             found[name] = (1 - FLOOR) * share + FLOOR / size
         for key, probs in found.items():

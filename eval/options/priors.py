@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 import torch
 
 from eval.options.planner import OptionPlanner
+from eval.worlds.macros import MacroPrior
 from neuroprior import MarkovPrior, Plans, Prior, SamplingPlanner, UniformPrior
 from neuroprior.behaviour.analysis.comparison import score
-from neuroprior.priors import MacroPrior, SwitchingPrior
+from neuroprior.priors import SwitchingPrior
 
 ORDERS = range(8)
 """Orders of the flat chains."""
@@ -18,9 +19,6 @@ SMOOTHINGS = (1, 4, 16, 64, 256, 1024)
 
 VALIDATION = 0.1
 """Share of the training plans on which the order of the flat chain is chosen."""
-
-MACROS, MACRO_ORDER = 16, 2
-"""Number of macro-actions, and the order of the chain over actions and macro-actions."""
 
 EM: dict[str, Any] = {"restarts": 1, "max_iterations": 25, "folds": 3}
 """How the switching priors are fitted: fewer starts than by default, for time."""
@@ -87,8 +85,8 @@ def entrants(
         if num_contexts is not None:
             found.append(entrant(f"constant-{number}", switching(number, switching="constant")))
     if num_contexts is None:
-        macro = MacroPrior(actions, MarkovPrior(actions + MACROS, MACRO_ORDER)).fit(training)
-        found = [entrant("uniform", UniformPrior(actions)), *found, entrant("macro", macro)]
+        macro = entrant("macro", MacroPrior(actions).fit(training))
+        found = [entrant("uniform", UniformPrior(actions)), *found, macro]
     return found
 
 

@@ -12,7 +12,6 @@ from neuroprior.control.priors.autoregressive import AutoregressivePrior
 from neuroprior.control.priors.networks import VectorGRU
 from neuroprior.control.priors.noise import NoisePrior
 from neuroprior.control.priors.stored_windows import StoredWindows
-from neuroprior.control.priors.synergies import StepSynergies
 from neuroprior.control.priors.vector_prior import GaussianForecast, VectorPrior
 from neuroprior.control.testing.planners import check_vector_planner
 from neuroprior.control.testing.priors import check_vector_prior
@@ -42,7 +41,6 @@ __all__ = [
     "PlanarArm",
     "Shares",
     "ShootingPlanner",
-    "StepSynergies",
     "StoredWindows",
     "VectorDecision",
     "VectorGRU",

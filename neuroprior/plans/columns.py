@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from neuroprior._checks import check_single_precision, is_whole, warn_caller
+from neuroprior._files import MISSING_LABELS
 
 Integers = NDArray[np.integer[Any]]
 Floats = NDArray[np.floating[Any]]
@@ -31,15 +32,12 @@ SHOWN = 8
 NUMBERED = ("action", "context")
 """Columns that hold numbers or names alone. Elsewhere, as among groups, one name makes names of all."""
 
-MISSING_LABELS = frozenset(
-    ("", "nan", "na", "n/a", "n.a.", "<na>", "null", "?", "-", "#n/a", "#value!", "#ref!", "#name?", "#div/0!", "#num!")
-)
-"""What stands for no label in tables, in lower case."""
+_MISSING = frozenset(MISSING_LABELS)
 
 
 def is_missing(text: str) -> bool:
     """Whether a cell holds no label."""
-    return text.strip().lower() in MISSING_LABELS
+    return text.strip().lower() in _MISSING
 
 
 def check_file(path: Path) -> None:

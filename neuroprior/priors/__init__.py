@@ -3,8 +3,7 @@
 from neuroprior.priors.counts import ContextTreePrior, Leaf, MarkovPrior
 from neuroprior.priors.ensembles import CombinedPrior, MixturePrior, StackedPrior
 from neuroprior.priors.fitting import fit
-from neuroprior.priors.intentions import Posterior, forecast, infer
-from neuroprior.priors.macros import Macro, MacroPrior, learn_macros
+from neuroprior.priors.intentions import Posterior, infer
 from neuroprior.priors.matching import decode, match_plans
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
 from neuroprior.priors.prior import Prior
@@ -14,14 +13,11 @@ from neuroprior.priors.uniform import UniformPrior
 
 __all__ = [
     "Posterior",
-    "forecast",
     "infer",
     "CombinedPrior",
     "ContextTreePrior",
     "GRUPrior",
     "Leaf",
-    "Macro",
-    "MacroPrior",
     "MarkovPrior",
     "MixturePrior",
     "ModePosterior",
@@ -32,7 +28,6 @@ __all__ = [
     "UniformPrior",
     "decode",
     "fit",
-    "learn_macros",
     "load",
     "match_plans",
     "save",

@@ -1,4 +1,4 @@
-"""Which of several known intentions an observed agent follows, one prior each, and where it will go."""
+"""Which of several known intentions an observed agent follows, one prior each."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,14 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_alike_named, check_share, check_sizes, is_number
-from neuroprior._random import generator_on
+from neuroprior._checks import check_alike_named, check_share, is_number
 from neuroprior.plans import Plans
 from neuroprior.priors.matching import learned_names, match_plans
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.scoring import plan_frame
-from neuroprior.sampling import sample_in_world
-from neuroprior.worlds.world import World
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,82 +117,6 @@ def infer(
         now = torch.where(mask[:, t, None], joint - total, now)
         found.append(now)
     return Posterior(tuple(named), torch.stack(found, 1), observed)
-
-
-@torch.no_grad()
-def forecast(
-    priors: Mapping[str, Prior] | Sequence[Prior],
-    world: World,
-    state: Tensor,
-    posterior: Posterior | Tensor,
-    length: int,
-    num_plans: int,
-    *,
-    targets: Tensor,
-    within: bool = False,
-    generator: torch.Generator | None = None,
-) -> Tensor:
-    """How probably agents will be in each of some states, from samples of each intention's prior in the world.
-
-    The priors begin anew in `state`: one whose predictions depend on actions before it does not know these. The
-    intention stays what it is.
-
-    Args:
-        priors: one fitted prior for each of K intentions, as in `infer`.
-        world: in which the agents act.
-        state: `[B, ...]`: where they are.
-        posterior: that of `infer`, of which the last is taken, or probabilities `[B, K]`.
-        length: number of steps ahead.
-        num_plans: samples for each agent and intention, P; a share of them has a standard error of at most
-            1 / (2 sqrt(P)).
-        targets: states `[S, ...]`.
-        within: count those that are in the state after any of the steps, not after the last alone.
-        generator: draws actions and the world's steps.
-
-    Returns:
-        Probabilities `[B, S]`, float64, on the CPU.
-
-    Raises:
-        ValueError: an argument is out of range, or shapes do not fit one another.
-
-    Example:
-        >>> world, priors = (
-        ...     gridworld(5, 5, edges="torus", seed=0),
-        ...     {"a chain": MarkovPrior(4, 1), "anywhere": UniformPrior(4)},
-        ... )
-        >>> goals = torch.tensor([1, 5])
-        >>> forecast(priors, world, torch.tensor([0]), torch.tensor([[0.5, 0.5]]), 2, 50, targets=goals).shape
-        torch.Size([1, 2])
-    """
-    named = _named(priors)
-    check_sizes(length=length, num_plans=num_plans)
-    world.check_state(state)
-    if isinstance(posterior, Posterior) and list(posterior.names) != list(named):
-        names = ", ".join(named), ", ".join(posterior.names)
-        raise ValueError(f"`posterior` must be that of the priors {names[0]}, got that of {names[1]}")
-    probs = posterior.log_probs[:, -1].exp() if isinstance(posterior, Posterior) else torch.as_tensor(posterior)
-    probs = probs.double().cpu()
-    if probs.shape != (len(state), len(named)):
-        raise ValueError(
-            f"`posterior` must have shape [B, K] = {[len(state), len(named)]} (a row for each state, a column for"
-            f" each prior), got {list(probs.shape)}"
-        )
-    if not bool(((probs >= 0).all(-1) & ((probs.sum(-1) - 1).abs() < 1e-3)).all()):
-        raise ValueError("`posterior` must be probabilities that sum to 1 in each row; of log_probs take exp()")
-    targets = torch.as_tensor(targets, device=state.device)
-    if targets.dim() != state.dim() or targets.shape[1:] != state.shape[1:]:
-        raise ValueError(f"`targets` must be states of shape {['S', *state.shape[1:]]}, got {list(targets.shape)}")
-    world.check_state(targets)
-    generator = generator_on(generator, state.device)
-    shares = []
-    for prior in named.values():
-        _, rollout = sample_in_world(prior, world, state, num_plans, length, generator=generator, keep_states=within)
-        reached = rollout.final_state[:, :, None] if rollout.states is None else rollout.states
-        # One target at a time bounds memory: [B, P, L] (and the state's own dimensions).
-        hits = [(reached == target).flatten(3).all(-1) if state.dim() > 1 else reached == target for target in targets]
-        none = torch.zeros(len(state), 0)
-        shares.append(torch.stack([hit.any(2).double().mean(1) for hit in hits], -1).cpu() if hits else none.double())
-    return (torch.stack(shares, -1) * probs[:, None]).sum(-1)
 
 
 def _named(priors: Mapping[str, Prior] | Sequence[Prior]) -> dict[str, Prior]:

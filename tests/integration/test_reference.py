@@ -85,7 +85,7 @@ WITHOUT_EXAMPLE = {
             "GroupDrift",
             "HorizonRound",
         ),
-        *("Interval", "LagInformation", "Leaf", "Macro", "Memory", "ModeChoice", "ModePosterior", "Motif"),
+        *("Interval", "LagInformation", "Leaf", "Memory", "ModeChoice", "ModePosterior", "Motif"),
         *("PermutationDesign", "PlanDrift", "PositionDrift", "Posterior", "Rollout", "Row", "Score", "Search"),
         *("Sizes", "Steps", "Sweep", "TooLargeError", "Transitions", "Tuned", "VectorDecision"),
     },

@@ -189,11 +189,9 @@ def test_the_number_of_contexts_may_be_more_than_occur(tmp_path):
 
 
 INSIDE = '[{"prior": "MarkovPrior", "config": {"num_actions": 3}}, {"prior": "GRUPrior", "config": {"num_actions": 3}}]'
-INNER = '{"prior": "GRUPrior", "config": {"num_actions": 5, "hidden_size": 8}}'
 MADE_OF_PRIORS = {
     "StackedPrior": ["--prior.hidden_size", "8", "--prior.depth", "2"],
     "MixturePrior": ["--prior.experts", INSIDE],
-    "MacroPrior": ["--prior.inner", INNER],
 }
 
 

@@ -14,7 +14,6 @@ from neuroprior.priors import (
     CombinedPrior,
     ContextTreePrior,
     GRUPrior,
-    MacroPrior,
     MarkovPrior,
     MixturePrior,
     Prior,
@@ -37,18 +36,16 @@ COUNTS = {
     "tree": lambda: ContextTreePrior(A, 3, beta=0.25, alpha=0.5, base="uniform"),
     "semi-markov": lambda: SemiMarkovPrior(A, MarkovPrior(A, 2), laws=["gamma", "weibull"], transitions=False),
     "semi-markov context": lambda: SemiMarkovPrior(A, num_contexts=C),
-    "macro of counts": lambda: MacroPrior(A, MarkovPrior(A + 2, 1), by="compression"),
 }
 NETWORKS = {
     "gru": lambda: GRUPrior(A, 8, num_layers=2, window=3, lags=2, dropout=0.1),
     "gru context": lambda: GRUPrior(A, 8, num_contexts=C),
     "transformer": lambda: TransformerPrior(A, 16, num_heads=2, context_size=2),
     "stacked": lambda: StackedPrior(A, 8, orders=(1, 2), depth=3, num_contexts=C),
-    "mixture": lambda: MixturePrior(A, [MarkovPrior(A, 1), GRUPrior(A, 8), MacroPrior(A, GRUPrior(A + 1, 8))]),
+    "mixture": lambda: MixturePrior(A, [MarkovPrior(A, 1), GRUPrior(A, 8)]),
     "nested mixture": lambda: MixturePrior(A, [MixturePrior(A, [StackedPrior(A, 8, depth=2)]), UniformPrior(A)]),
     "semi-markov gru": lambda: SemiMarkovPrior(A, GRUPrior(A, 8, context_size=2)),
-    "macro": lambda: MacroPrior(A, GRUPrior(A + 2, 8)),
-    "combined": lambda: CombinedPrior(A, [MarkovPrior(A, 1), GRUPrior(A, 8), MacroPrior(A, GRUPrior(A + 1, 8))]),
+    "combined": lambda: CombinedPrior(A, [MarkovPrior(A, 1), GRUPrior(A, 8)]),
 }
 ALL = COUNTS | NETWORKS
 
@@ -116,7 +113,7 @@ def test_a_mixture_that_counts_takes_the_share_for_its_weights_alone():
         prior.fit(plans_for(prior), max_steps=3)
 
 
-@pytest.mark.parametrize("name", ["stacked", "mixture", "macro"])
+@pytest.mark.parametrize("name", ["stacked", "mixture"])
 def test_settings_reach_the_networks_inside(name):
     """The seed, the number of steps and the learning rate all change what is learned; the same ones give the same."""
 
@@ -132,7 +129,7 @@ def test_settings_reach_the_networks_inside(name):
     assert not torch.equal(first, weights(learning_rate=1e-4))
 
 
-@pytest.mark.parametrize("name", ["markov", "gru", "macro of counts"])
+@pytest.mark.parametrize("name", ["markov", "gru", "tree"])
 def test_actions_alone_are_plans_without_context(name):
     prior = ALL[name]()
     plans = plans_for(prior)

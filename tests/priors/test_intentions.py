@@ -1,16 +1,13 @@
-"""The posterior over intentions by hand and over all paths of intentions; the forecast against exact enumeration."""
+"""The posterior over intentions by hand and over all paths of intentions."""
 
 from itertools import product
-from math import sqrt
 
 import pytest
 import torch
-from scipy import stats
 
 from neuroprior.plans import Plans
-from neuroprior.priors import MarkovPrior, UniformPrior, forecast, infer
-from neuroprior.worlds import TabularWorld
-from tests.support.sources import FALSE_ALARM, refuses, seeded
+from neuroprior.priors import MarkovPrior, UniformPrior, infer
+from tests.support.sources import refuses
 
 
 def chain(*rows):
@@ -112,44 +109,6 @@ def test_refusals():
         infer([], ACTIONS)
     with refuses("their own"):
         infer(PRIORS, Plans(ACTIONS, 2), context=ACTIONS)
-    with refuses("`posterior` must have shape"):
-        forecast(PRIORS, RING, torch.tensor([0]), torch.ones(1, 2), 1, 1, targets=torch.tensor([0]))
-
-
-RING = TabularWorld(torch.tensor([[3, 1], [0, 2], [1, 3], [2, 0]]), torch.zeros(4, 2))
-
-
-@pytest.mark.parametrize("within", [False, True])
-def test_forecast(within):
-    """On a ring of four cells: each share is within its exact sampling error of that over all plans of 3 actions."""
-    state, posterior, number = torch.tensor([0, 2]), torch.tensor([[0.7, 0.1, 0.2], [0.1, 0.2, 0.7]]), 4000
-    plans = torch.tensor(list(product(range(2), repeat=3)))
-    probs = likelihoods(plans).prod(1)  # [8, K]
-    states = RING.rollout(state, plans.expand(2, 8, 3), keep_states=True).states
-    reached = states if within else states[:, :, -1:]
-    hit = (reached[..., None] == torch.arange(4)).any(2).double()  # [2, 8, 4]
-    share = torch.einsum("bps,pk->bsk", hit, probs)
-    exact = (share * posterior[:, None]).sum(-1)
-    found = forecast(
-        PRIORS, RING, state, posterior, 3, number, targets=torch.arange(4), within=within, generator=seeded(0)
-    )
-    error = ((share * (1 - share)).clamp(min=0) * posterior[:, None].double() ** 2).sum(-1).div(number).sqrt()
-    # Normal limits, over the 8 shares: FALSE_ALARM in all.
-    limit = stats.norm.isf(FALSE_ALARM / 16)
-    assert ((found - exact).abs() <= limit * error + 1e-6).all()
-    assert float(error.max()) < 1 / (2 * sqrt(number))
-
-
-def test_a_forecast_is_by_the_last_posterior_of_each_agent():
-    """That after all of its observed actions, also where those of others go on."""
-    plans = Plans(ACTIONS, 2, lengths=torch.tensor([2, 4]))
-    observed = infer(PRIORS, plans, weights=[0.1, 0.1, 0.8])
-    given = RING, torch.tensor([0, 2])
-    how = {"targets": torch.arange(4), "length": 2, "num_plans": 50}
-    last = torch.stack([observed.log_probs[0, 2], observed.log_probs[1, 4]]).exp()
-    found, same = (forecast(PRIORS, *given, p, generator=seeded(0), **how) for p in (observed, last))
-    assert found.equal(same)
-    assert not found.equal(forecast(PRIORS, *given, observed.log_probs[:, 0].exp(), generator=seeded(0), **how))
 
 
 def test_what_is_impossible():

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from neuroprior.behaviour.reading.frames import are_frames, number_rows, read_labelled_frames
 from neuroprior.behaviour.reading.sequences import strings_of_sequences
-from neuroprior.behaviour.reading.table import MIN_REPEATS, Floats, Part, Table
+from neuroprior.behaviour.reading.table import Floats, Part, Table
 from neuroprior.behaviour.reading.times import CLOCKS, DAY, Times, smallest_unit
 
 
@@ -146,14 +146,7 @@ def _notes_on_labels(table: Table, labels: NDArray[Any], part: Part, only_starts
     if missing.any():
         what = f"rows have no label (first in {table.place(int(missing.argmax()))})"
         notes.append(f"{missing.sum():,} of {len(labels):,} {what}: another fragment begins after each")
-    behaviour = part.events["behaviour"].to_numpy(object)
-    if len(behaviour) > 1:
-        repeats = (behaviour[1:] == behaviour[:-1]) & (np.diff(part.fragment) == 0)
-        if (share := repeats.mean()) > MIN_REPEATS:
-            table.first_notes.append(
-                f"{share:.0%} of the behaviours repeat the one before: if a row is a frame,"
-                " --merge_repeats true makes each run one bout"
-            )
+    part.note_repeats("behaviours", " if a row is a frame,")
     if only_starts:
         notes.append("no stops are known, and no durations (--ends next: each behaviour lasts until the next begins)")
     return notes

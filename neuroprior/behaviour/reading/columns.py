@@ -8,7 +8,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from neuroprior.behaviour.reading.names import DEEPETHOGRAM, NAMES, PROGRAMS, SIMBA, SUMMARY, WORDS, Program, plain
+from neuroprior.behaviour.reading.names import (
+    DEEPETHOGRAM,
+    NAMES,
+    PROGRAMS,
+    SIMBA,
+    STEM_NUMBER,
+    SUMMARY,
+    WORDS,
+    Program,
+    plain,
+)
 from neuroprior.behaviour.reading.problems import ReadingError
 from neuroprior.behaviour.reading.sheets import Sheet
 from neuroprior.behaviour.reading.times import MISSING_TIMES, count_times
@@ -18,7 +28,6 @@ NOT_USED = "none"
 
 INDICATORS = frozenset(("0", "1", "", "-1", "true", "false", "0.0", "1.0", "-1.0"))
 MONTH = re.compile(r"(jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec)[a-z]*[._\- ]?(\d{2}|\d{4})", re.IGNORECASE)
-STEM_NUMBER = re.compile(r"(.*?[^\d.])?[._\- ]?(\d+)")
 NO_BEHAVIOURS = re.compile(r"(low[_ ]prob|in zone|result|probability|arena|zone)", re.IGNORECASE)
 """Columns of zeros and ones that programs write beside those of behaviours."""
 

@@ -149,11 +149,8 @@ WORDS = {
 }  # fmt: skip
 """Words for the kinds of rows where starts and stops have rows of their own, in lower case."""
 
-MISSING_WORDS = (
-    "", "nan", "na", "n/a", "n.a.", "<na>", "null", "?", "-", "#n/a", "#value!", "#ref!", "#name?", "#div/0!",
-    "#num!",
-)  # fmt: skip
-"""Words for no label, in lower case."""
+STEM_NUMBER = re.compile(r"(.*?[^\d.])?[._\- ]?(\d+)")
+"""A name that ends in a number: its stem, if any, and the number."""
 
 SUMMARY = re.compile(r"\b(?:total|mean|median|average|std|sd|number|frequency|occurr?ences)\b")
 """Occurs in names of columns that sum events up."""

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
+from neuroprior._files import MISSING_LABELS
 from neuroprior.behaviour.reading.columns import Columns, make_columns
-from neuroprior.behaviour.reading.names import MISSING_WORDS
 
 Missing = Literal["gap", "nothing", "label", "error"]
 Unpaired = Literal["error", "drop", "open"]
@@ -48,7 +48,7 @@ class Options:
 
     columns: Columns | Mapping[str, Any] | None = None
     missing: Missing | None = None
-    missing_words: Sequence[str] = MISSING_WORDS
+    missing_words: Sequence[str] = MISSING_LABELS
     unpaired: Unpaired = "error"
     overlaps: Overlaps = "error"
     ends: Ends = "auto"

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from neuroprior.behaviour.reading.names import SEQUENCE_MISSING, plain
-from neuroprior.behaviour.reading.table import MIN_REPEATS, Part, Table
+from neuroprior.behaviour.reading.table import Part, Table
 
 STATE_AND_DURATION = re.compile(r"\(?([^(),]+),\s*(\d+(?:\.\d+)?)\)?")
 SEPARATORS = (" > ", "->", "-", "|", ";", ",", " ", "/")
@@ -45,12 +45,7 @@ def rows_of_sequences(table: Table) -> Part:
         what = "cells within sequences have no label: another fragment begins after each"
         table.notes.append(f"{(flat == '').sum():,} {what}")
     part = table.part(rows.astype(np.int64), flat, steps.astype(np.float64), steps + 1.0)
-    behaviour = part.events["behaviour"].to_numpy(object)
-    repeats = (behaviour[1:] == behaviour[:-1]) & (np.diff(part.fragment) == 0)
-    if len(repeats) and repeats.mean() > MIN_REPEATS:
-        part.first_notes.append(
-            f"{repeats.mean():.0%} of the cells repeat the one before: --merge_repeats true makes each run one bout"
-        )
+    part.note_repeats("cells")
     return part
 
 

@@ -20,7 +20,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from neuroprior.behaviour.reading.names import KNOWN_NAMES, PROGRAMS, plain
+from neuroprior.behaviour.reading.names import KNOWN_NAMES, PROGRAMS, STEM_NUMBER, plain
 from neuroprior.behaviour.reading.problems import ReadingError
 
 SEPARATORS = (",", ";", "\t", "|")
@@ -35,7 +35,6 @@ TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".tab", ".xlsx", ".xls", ".ods", ".par
 
 HEADER_LINES = re.compile(r"number of header lines:?", re.IGNORECASE)
 NUMBER = re.compile(r"\s*[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?\s*")
-STEM_AND_NUMBER = re.compile(r"(.*?)[._\- ]?(\d+)")
 
 
 @dataclass
@@ -472,7 +471,7 @@ def _is_header(row: list[str], cells: Any, at: int) -> bool:
     if all_numbers:
         likely = not row[0] or float(words[0].replace(",", ".")) in (0, 1) or len(words) > 5
         return len(words) > 2 and _count_up(words) and not _count_up(below.iloc[0]) and likely
-    numbered = [STEM_AND_NUMBER.fullmatch(word) for word in words]
+    numbered = [STEM_NUMBER.fullmatch(word) for word in words]
     stems = Counter(match[1] for match in numbered if match)
     if stems and max(stems.values()) > max(2, len(words) // 2):
         return True

@@ -63,6 +63,19 @@ class Part:
     spans: pd.DataFrame | None = None
     renamed: set[str] = field(default_factory=set)
 
+    def note_repeats(self, what: str, when: str = "") -> None:
+        """Notes that many labels repeat the one before, and how repeats become one bout.
+
+        Args:
+            what: the table's word for what has a label.
+            when: a condition for that, with a comma.
+        """
+        behaviour = self.events["behaviour"].to_numpy(object)
+        repeats = (behaviour[1:] == behaviour[:-1]) & (np.diff(self.fragment) == 0)
+        if len(repeats) and (share := repeats.mean()) > MIN_REPEATS:
+            advice = f"{when} --merge_repeats true makes each run one bout"
+            self.first_notes.append(f"{share:.0%} of the {what} repeat the one before:{advice}")
+
 
 class Table:
     """A sheet with the roles of its columns, and what its layouts share.

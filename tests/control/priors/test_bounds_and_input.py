@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from neuroprior.control import AutoregressivePrior, NoisePrior, StepSynergies, StoredWindows, VectorGRU, VectorPlans
+from neuroprior.control import AutoregressivePrior, NoisePrior, StoredWindows, VectorGRU, VectorPlans
 from neuroprior.testing import check_prior
 from tests.support.sources import seeded
 
 LINEAR = {
     "noise": lambda low, high: NoisePrior(low, high, None, memory=4),
     "autoregressive": lambda low, high: AutoregressivePrior(low, high, 2),
-    "synergies": StepSynergies,
 }
 CLOSED = LINEAR | {"stored windows": lambda low, high: StoredWindows(low, high, 2, 4, max_windows=6)}
 WIDE = CLOSED | {"stored windows": lambda low, high: StoredWindows(low, high, 2, 10)}
@@ -192,7 +191,7 @@ def test_stored_windows_are_followed_in_each_dimension_as_closely_as_it_varies()
     assert drawn[2] < 0.02
 
 
-@pytest.mark.parametrize("kind", [NoisePrior, AutoregressivePrior, StepSynergies])
+@pytest.mark.parametrize("kind", [NoisePrior, AutoregressivePrior])
 def test_vectors_beyond_the_bounds_count_as_such(kind):
     """The censored Gaussian with standard deviation 2: five standard errors of 20,000 draws are about .1."""
     values = (2 * torch.randn(400, 50, 1, generator=seeded(0)) + 0.5).clamp(-1, 1)
@@ -207,7 +206,7 @@ def test_vectors_beyond_the_bounds_count_as_such(kind):
 
 @pytest.mark.parametrize(
     ("make", "share"),
-    [(AutoregressivePrior, 0.9), (StepSynergies, 0.9), (KINDS["noise"], 0.5)],
+    [(AutoregressivePrior, 0.9), (KINDS["noise"], 0.5)],
 )
 def test_about_as_many_vectors_are_drawn_at_the_bounds_as_there_are(make, share):
     values = walk(40, 0, 0.8, 2)
@@ -216,7 +215,7 @@ def test_about_as_many_vectors_are_drawn_at_the_bounds_as_there_are(make, share)
     assert share * own < drawn < 1.1 * own
 
 
-@pytest.mark.parametrize("make", [AutoregressivePrior, StepSynergies, KINDS["noise"]])
+@pytest.mark.parametrize("make", [AutoregressivePrior, KINDS["noise"]])
 def test_settings_that_are_compared_one_by_one_are_the_same(make, monkeypatch):
     plans = VectorPlans(walk(12, 0, 0.6, 3), [-1.0] * 3, [1.0] * 3)
     together = make([-1.0] * 3, [1.0] * 3).fit(plans, generator=seeded(0))
@@ -272,8 +271,7 @@ def test_what_never_changes_beside_others_does_not_borrow_their_spread(kind):
     moving = torch.randn(2, 12, 2, generator=seeded(0)).cumsum(1).mul(0.1).tanh()
     values = torch.cat([moving[..., :1], torch.full((2, 12, 1), 3.0), moving[..., 1:]], -1)
     plans = VectorPlans(values, [-1.0, -1e4, -1.0], [1.0, 1e4, 1.0])
-    make = {"synergies": lambda low, high: StepSynergies(low, high, 1)}.get(kind, LINEAR[kind])
-    prior = make(plans.action_low, plans.action_high).fit(plans, generator=seeded(0))
+    prior = LINEAR[kind](plans.action_low, plans.action_high).fit(plans, generator=seeded(0))
     drawn = prior.sample(100, 10, generator=seeded(1))[..., 1]
     assert float((drawn - 3).std()) == pytest.approx(10, rel=0.1)
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from neuroprior.control import AutoregressivePrior, NoisePrior, StepSynergies, VectorGRU, VectorPlans
+from neuroprior.control import AutoregressivePrior, NoisePrior, VectorGRU, VectorPlans
 from tests.support.sources import seeded
 
 LOW, HIGH = torch.tensor([-1.0, -2.0, 0.0]), torch.tensor([1.0, 3.0, 0.5])
@@ -35,7 +35,6 @@ def pasts(length, number=2):
         lambda low, high: NoisePrior(low, high, exponent=1.5, memory=6),
         NoisePrior,
         lambda low, high: AutoregressivePrior(low, high, order=3),
-        StepSynergies,
     ],
 )
 def test_linear_priors(make, length):

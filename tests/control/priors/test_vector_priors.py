@@ -10,7 +10,6 @@ from neuroprior.control import (
     AutoregressivePrior,
     GaussianForecast,
     NoisePrior,
-    StepSynergies,
     StoredWindows,
     VectorGRU,
     VectorPlans,
@@ -27,7 +26,6 @@ KINDS = {
     "white": NoisePrior,
     "coloured": lambda low, high: NoisePrior(low, high, None, memory=6),
     "autoregressive": AutoregressivePrior,
-    "synergies": StepSynergies,
     "stored windows": lambda low, high: StoredWindows(low, high, match=2, horizon=4, max_windows=10),
 }
 
@@ -152,31 +150,6 @@ def test_the_exponent_of_noise_is_found(exponent):
     assert NoisePrior([-1.0], [1.0], None, memory=20).fit(plans).exponent == exponent
 
 
-def test_synergies_explain_what_they_explain():
-    """Three dimensions are driven by one signal."""
-    phase = 6.28 * torch.rand(50, 1, generator=seeded(0)) + 0.5 * torch.arange(60)
-    pattern = torch.tensor([0.5, -0.3, 0.4])
-    values = torch.sin(phase)[..., None] * pattern + 0.01 * torch.randn(50, 60, 3, generator=seeded(1))
-    plans = VectorPlans(values, -torch.ones(3), torch.ones(3))
-    prior = StepSynergies(plans.action_low, plans.action_high).fit(plans, generator=seeded(0))
-    assert prior.explained[0] > 0.99
-    assert len(prior.explained) == 3
-    # Beside one synergy are two dimensions of noise.
-    one = StepSynergies(plans.action_low, plans.action_high, 1).fit(plans)
-    drawn = one.sample(2000, 2, generator=seeded(1))[0].flatten(0, 1)
-    along = (drawn - drawn.mean(0)) @ (pattern / pattern.norm())
-    assert float(drawn.var(0).sum() - along.var()) == pytest.approx(2 * 0.01**2, rel=0.1)
-
-
-def test_all_synergies_are_the_autoregression():
-    """With every component kept, both are the same regression on the same windows, but for a ridge."""
-    plans = source(30, 60)
-    synergies = StepSynergies(LOW, HIGH, 2).fit(plans)
-    chain = AutoregressivePrior(LOW, HIGH, 1).fit(plans, generator=seeded(0))
-    nats = [each.action_log_probs(plans)[:, 1:].mean() for each in (synergies, chain)]
-    assert abs(float(nats[0] - nats[1])) < 0.01
-
-
 def test_a_stored_window_is_found_by_its_past():
     ramps = torch.linspace(-0.9, 0.9, 30)
     plans = VectorPlans(torch.stack([ramps, -ramps])[..., None], [-1.0], [1.0])
@@ -278,7 +251,6 @@ PAIR = VectorPlans(torch.zeros(3, 7, 2), LOW, HIGH)
         (lambda: AutoregressivePrior([-1.0], [1.0], 1.5), "order"),
         (lambda: AutoregressivePrior(LOW, HIGH, 7).fit(PAIR), "`order` must be below .* 7, got 7"),
         (lambda: AutoregressivePrior(LOW, HIGH, 10**7), "order"),
-        (lambda: StepSynergies([-1.0], [1.0], 2), "`num_components` must be at most 1"),
         (lambda: StoredWindows([-1.0], [1.0], horizon=0), "horizon"),
         (lambda: StoredWindows(LOW, HIGH, match=3, horizon=5).fit(PAIR), "`plans` must have one of 8 .* got at most 7"),
         (lambda: VectorGRU([-1.0], [1.0], dropout="a"), "`dropout` must be at least 0 and below 1"),
@@ -391,12 +363,11 @@ def test_a_single_plan_is_known_by_the_vectors_before_each_part():
     assert (chain.action_log_probs(test) - noise.action_log_probs(test)).mean() > 1
 
 
-@pytest.mark.parametrize("make", [AutoregressivePrior, StepSynergies])
-def test_plans_of_few_vectors_do_not_run_away(make):
+def test_plans_of_few_vectors_do_not_run_away():
     """By chance, the recursions of some of these would grow exponentially."""
     for seed in range(8):
         plans = walks(2, 25, 4, seed)
-        prior = make(plans.action_low, plans.action_high).fit(plans, generator=seeded(0))
+        prior = AutoregressivePrior(plans.action_low, plans.action_high).fit(plans, generator=seeded(0))
         drawn = prior.sample(100, 50, generator=seeded(1))[0]
         assert (drawn[:, 30:].std((0, 1)) < 3 * plans.actions.std((0, 1))).all(), seed
         assert (drawn.abs() == 1).float().mean() < 0.01

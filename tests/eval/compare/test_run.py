@@ -1,5 +1,6 @@
 """Runs of `eval compare`: curves with known values, starts, and whole runs in small worlds."""
 
+import csv
 import json
 from dataclasses import replace
 from functools import partial
@@ -350,11 +351,16 @@ def test_ways_of_sampling_are_chosen_where_priors_did_not_learn(monkeypatch):
 
 
 def test_the_documentation_describes_the_worlds():
-    text = (Path(__file__).parents[3] / "docs" / "compare.md").read_text()
-    for name, task in TASKS.items():
+    docs = Path(__file__).parents[3] / "docs"
+    text = (docs / "compare.md").read_text()
+    with open(docs / "compare_worlds.csv", newline="", encoding="utf-8") as file:
+        _, *rows = csv.reader(file)
+    assert len(rows) == len(TASKS)
+    for row, (name, task) in zip(rows, TASKS.items(), strict=True):
         lengths, contexts = ", ".join(map(str, task.lengths)), ", ".join(task.contexts)
-        row = (f"`{name}`", task.about, task.num_actions, task.depth, lengths, contexts, task.start_factor)
-        assert f"| {' | '.join(map(str, row))} |" in text
+        own = (name, task.about, task.num_actions, task.depth, lengths, contexts, task.start_factor)
+        assert row == list(map(str, own))
+        assert f"`{name}`" in text
 
 
 def test_tables_hold_how_candidates_were_drawn(run):

@@ -21,9 +21,8 @@ from neuroprior.behaviour import (
 )
 from neuroprior.behaviour.analysis.lags import pieces
 from neuroprior.behaviour.analysis.modes import mode_transitions
-from neuroprior.priors import ContextTreePrior, MarkovPrior, SwitchingPrior, UniformPrior, forecast, infer
+from neuroprior.priors import ContextTreePrior, MarkovPrior, SwitchingPrior, infer
 from neuroprior.priors.scoring import score as score_table
-from neuroprior.worlds import cube, gridworld
 from tests.support.pinned.data import behaviour, timed
 from tests.support.sources import seeded
 from tests.support.unchanged import case
@@ -91,19 +90,8 @@ def intentions():
         "switching": infer(priors, actions, switch=0.2, weights=[0.5, 0.2, 0.3]),
         "tempered": infer(priors, behaviour(5, 6, 4, seed=9), power=0.5),
     }
-    world = gridworld(4, 4)
-    state, targets = world.reset(5, seeded(0)), torch.tensor([0, 5, 9])
     found: dict[str, Any] = {name: one.log_probs for name, one in posteriors.items()}
     found["frame"] = posteriors["even"].to_frame()
-    for within_ in (False, True):
-        found[f"forecast {within_}"] = forecast(
-            priors, world, state, posteriors["even"], 4, 50, targets=targets, within=within_, generator=seeded(1)
-        )
-    cube_ = cube(scramble=2)
-    state = cube_.reset(3, seeded(0))
-    found["forecast of cubes"] = forecast(
-        [UniformPrior(cube_.num_actions)], cube_, state, torch.ones(3, 1), 2, 200, targets=state, generator=seeded(1)
-    )
     closed = {name: MarkovPrior(3, 1).fit(behaviour(20, 6, 2, seed=seed).with_end()) for seed, name in enumerate("ab")}
     found["with an end"] = [infer(closed, behaviour(4, 5, 2, seed=3).with_end()), infer(closed, actions[:3] % 2)]
     return found

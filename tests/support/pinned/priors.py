@@ -9,7 +9,6 @@ from neuroprior.behaviour import LAW_NAMES, DurationModel, SemiMarkovPrior
 from neuroprior.control import (
     AutoregressivePrior,
     NoisePrior,
-    StepSynergies,
     StoredWindows,
     VectorGRU,
     VectorPlans,
@@ -18,7 +17,6 @@ from neuroprior.plans import Plans
 from neuroprior.priors import (
     CombinedPrior,
     GRUPrior,
-    MacroPrior,
     MarkovPrior,
     MixturePrior,
     Prior,
@@ -27,10 +25,8 @@ from neuroprior.priors import (
     TransformerPrior,
     decode,
     fit,
-    learn_macros,
 )
 from neuroprior.priors.fitting import PRIORS
-from neuroprior.priors.macros import CRITERIA
 from neuroprior.puzzles import LogLinearPrior, Steps
 from neuroprior.sampling.states import tensors_in
 from tests.support.pinned.data import behaviour, timed
@@ -155,16 +151,6 @@ def durations():
     return found
 
 
-@case
-def macros():
-    plans, found = behaviour(30), {}
-    for by in CRITERIA:
-        learned, recoded = learn_macros(plans, 3, by)
-        found[by] = [learned, recoded.actions, recoded.lengths, recoded.num_actions, recoded.action_names]
-    prior = MacroPrior(3, MarkovPrior(5, 1), "compression").fit(plans)
-    return found | {"prior": of_prior(prior, plans)}
-
-
 @case(relative=2e-3)
 def networks():
     found = {}
@@ -255,7 +241,6 @@ def priors_of_vectors():
         ("white", NoisePrior(*ends), {}),
         ("coloured", NoisePrior(*ends, None, memory=5), {}),
         ("autoregressive", AutoregressivePrior(*ends), {}),
-        ("synergies", StepSynergies(*ends, 1), {}),
         ("stored", StoredWindows(*ends, match=2, horizon=4, max_windows=20), {}),
         ("gru", VectorGRU(*ends, width=8, num_components=2), few),
         ("gru, context", VectorGRU(*ends, 1, width=8, num_layers=2), few),
