@@ -100,20 +100,23 @@ class TransformerPrior(NeuralPrior):
     def encode(self, previous: Tensor, context: Tensor | None, hidden: State | None = None) -> tuple[Tensor, State]:
         """See `NeuralPrior.encode`.
 
-        `hidden` is the key-value cache `[N, S, num_layers, 2 * width]`, from the oldest step on, and the last
-        `lags` - 1 actions.
+        `hidden` is `(caches, number, recent)`: each layer's keys and values `[N, S, 2 * width]`, from the oldest step
+        on; how many steps were read, int64 `[N]`; and the last `lags` - 1 actions.
         """
         most = self.most_kept
         if most is not None and previous.shape[1] > max(most, FEWEST_AT_ONCE):
             return self._encode_in_parts(previous, context, hidden, max(most, FEWEST_AT_ONCE))
-        past, recent = (None, None) if hidden is None else hidden
+        if hidden is None:
+            hidden = ([None] * self.num_layers, previous.new_zeros(len(previous)), None)
+        pasts, number, recent = hidden
         x, recent = self.embedding(previous, context, recent, self.window)
         x = self.drop(x)
+        place = number[:, None] + torch.arange(previous.shape[1], device=previous.device)
         caches = []
-        for layer, block in enumerate(self.blocks):
-            x, cache = block(x, None if past is None else past[:, :, layer], self.span, self.window)
+        for past, block in zip(pasts, self.blocks, strict=True):
+            x, cache = block(x, past, place, self.span, self.window)
             caches.append(cache)
-        return self.head(self.norm(x)), (torch.stack(caches, 2), recent)
+        return self.head(self.norm(x)), (tuple(caches), place[:, -1] + 1, recent)
 
     def _encode_in_parts(
         self, previous: Tensor, context: Tensor | None, hidden: State | None, size: int
@@ -147,33 +150,30 @@ class Block(nn.Module):
         )
 
     def forward(
-        self, x: Tensor, past: Tensor | None, span: int | None, window: int | None = None
+        self, x: Tensor, past: Tensor | None, place: Tensor, span: int | None, window: int | None = None
     ) -> tuple[Tensor, Tensor]:
-        """`x [N, T, width]` after `past [N, S, 2 * width]`: the new `x`, and the keys and values to be kept.
+        """`x [N, T, width]` at steps `place [N, T]` after `past [N, S, 2 * width]`: the new `x`, and what is kept.
 
         Each step attends to itself and those before it, at most `span` back. With a `window`, each attends to the
         first one and to the last `window`, itself among them; the first is never further away than `window`, and is
-        kept. Keys are kept as they are, and rotated by their places among those that are kept when they are read: so
-        the distances are right whichever were dropped before.
+        kept.
         """
-        start, size = 0 if past is None else past.shape[1], x.shape[-1] // self.num_heads
-        query, key, value = self._project(x)
+        size = x.shape[-1] // self.num_heads
+        unturned, key, value = self._project(x)
+        turns = rotation(place, size)
+        query, kept = rotate(unturned, *turns), torch.cat([rotate(key, *turns), value], -1)
         if past is not None:
-            # under autocast new keys and values may be of another dtype than kept ones
-            key, value = torch.cat([past.to(key.dtype), torch.cat([key, value], -1)], 1).chunk(2, -1)
-        place = torch.arange(key.shape[1], device=x.device)
-        turned, turned_key = rotate(query, *rotation(place[start:], size)), rotate(key, *rotation(place, size))
+            kept = torch.cat([past.to(kept.dtype), kept], 1)  # under autocast the new ones may be of another dtype
+        key, value = kept.chunk(2, -1)
         if window is None or key.shape[1] <= window + 1:
-            mixed = self._attend(turned, turned_key, value, span)
+            mixed = self._attend(query, key, value, span)
         else:
-            near = rotate(query, *rotation(place[start:].clamp(max=window), size))
-            mixed = self._attend_to_first(turned, near, turned_key, value, window)
+            near = rotate(unturned, *rotation(place.clamp(max=window), size))
+            mixed = self._attend_to_first(query, near, key, value, window)
         most = span if window is None else window + 1
-        excess = 0 if most is None else max(key.shape[1] - most, 0)
-        kept = torch.cat([key, value], -1)
-        if excess:
+        if most is not None and kept.shape[1] > most:
             first = 0 if window is None else 1
-            kept = torch.cat([kept[:, :first], kept[:, first + excess :]], 1)
+            kept = torch.cat([kept[:, :first], kept[:, first - most :]], 1)
         return self._add(x, mixed), kept
 
     def _project(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -226,14 +226,14 @@ def reached(num: int, total: int, span: int, device: torch.device) -> Tensor:
 
 
 def rotation(place: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Cosine and sine `[T, size / 2]` of the angles by which heads of this size are rotated at `place [T]`."""
+    """Cosine and sine `[N, T, size / 2]` of the angles by which heads of this size are rotated at `place [N, T]`."""
     half = size // 2
-    angle = place[:, None] * 10_000 ** -(torch.arange(half, device=place.device) / half)
+    angle = place[..., None] * 10_000 ** -(torch.arange(half, device=place.device) / half)
     return angle.cos(), angle.sin()
 
 
 def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
     """Each pair of numbers of each head of `x [N, T, width]` rotated by the angles of its position, see `rotation`."""
     first, second = x.unflatten(-1, (-1, 2, cos.shape[-1])).unbind(-2)
-    cos, sin = cos[:, None], sin[:, None]
+    cos, sin = cos[..., None, :], sin[..., None, :]
     return torch.stack([first * cos - second * sin, first * sin + second * cos], -2).flatten(-3)

@@ -322,7 +322,7 @@ def test_steps_of_a_transformer_are_what_it_reads_at_once(lags, window, span, ta
     throughout = None if current is None else expand_context(current, len(action) + 1)
     whole = prior(torch.cat([action, action[:1]]).T, throughout).detach().transpose(0, 1)
     torch.testing.assert_close(whole, torch.stack(predicted), atol=1e-5, rtol=1e-4)
-    cache = (state[1] if takes else state)[0]
+    cache = (state[1] if takes else state)[0][0]
     assert cache.shape[1] == min(14, prior.most_kept or 14)
 
 
