@@ -12,6 +12,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
+from math import isnan, nan
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -20,6 +21,9 @@ from neuroprior._threads import one_thread
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
+
+QUIET_SECONDS = 9
+"""After which progress says something, though no job was finished."""
 
 SCHEDULER_SECONDS = 10
 """In which a Dask scheduler has to answer."""
@@ -85,15 +89,34 @@ class JobRun(Generic[Job, Result]):
     def do(
         self, jobs: Sequence[Job], *, processes: int | None = None, dask: str | None = None, title: str = "jobs"
     ) -> list[Result]:
-        """Do the jobs that have no result yet; returns the results of all, in the order of `jobs`.
+        """Do the jobs that have no result yet, see `each`; returns the results of all, in the order of `jobs`."""
+        for _ in self.each(jobs, processes=processes, dask=dask, title=title):
+            pass
+        return self.results(jobs)
 
-        Progress goes to standard error: a bar in a terminal, elsewhere a line for each finished job.
+    def results(self, jobs: Sequence[Job]) -> list[Result]:
+        """The results of finished jobs, see `read`."""
+        return [self.read(job) for job in jobs]
+
+    def each(
+        self,
+        jobs: Sequence[Job],
+        *,
+        processes: int | None = None,
+        dask: str | None = None,
+        title: str = "jobs",
+        cost: Callable[[Job], float] = lambda job: 1.0,
+    ) -> Iterator[float]:
+        """Do the jobs that have no result yet; yields the seconds that are left, about, whenever one is finished.
+
+        Progress goes to standard error: a bar in a terminal, elsewhere lines.
 
         Args:
             jobs: the jobs.
             processes: how many run at a time; None: one for each core.
             dask: the address of a Dask scheduler, `tcp://host:port`, whose workers do the jobs; None: this machine.
             title: what the progress is called.
+            cost: how long a job takes, compared with others.
 
         Raises:
             ValueError: a job failed (the message names it), or the cluster cannot be used.
@@ -101,22 +124,21 @@ class JobRun(Generic[Job, Result]):
             KeyboardInterrupt: the message says how to go on.
         """
         missing = [job for job in jobs if not self.finished(job)]
-        if missing:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            write_json(self.folder / "asked.json", self._asked)
-            try:
-                self._do(missing, processes or os.cpu_count() or 1, dask, Progress(title, len(jobs), len(missing)))
-            except KeyboardInterrupt as interrupted:
-                raise KeyboardInterrupt(
-                    f"interrupted; finished jobs are kept in {self.folder}, and the same command goes on"
-                ) from interrupted
-        return [self.read(job) for job in jobs]
-
-    def _do(self, jobs: Sequence[Job], processes: int, dask: str | None, progress: "Progress") -> None:
-        with progress:
-            for job, result in each_result(self.run, jobs, processes, dask, self.name):
-                self._save(self.path(job), result)
-                progress.advance(self.name(job))
+        if not missing:
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_json(self.folder / "asked.json", self._asked)
+        processes = min(processes or os.cpu_count() or 1, len(missing))
+        costs = [cost(job) for job in missing]
+        try:
+            with Progress(title, len(jobs), len(missing), sum(costs), sum(costs[1:processes])) as progress:
+                for job, result in each_result(self.run, missing, processes, dask, self.name):
+                    self._save(self.path(job), result)
+                    yield progress.advance(self.name(job), cost(job))
+        except KeyboardInterrupt as interrupted:
+            raise KeyboardInterrupt(
+                f"interrupted; finished jobs are kept in {self.folder}, and the same command goes on"
+            ) from interrupted
 
 
 def each_result(
@@ -267,48 +289,80 @@ def _unless_given_up(error: threading.ExceptHookArgs) -> None:
 
 
 class Progress:
-    """Progress on standard error: a bar in a terminal, elsewhere a line for each finished job.
+    """Progress on standard error: a bar in a terminal; elsewhere a line for each job, and at least every 10 seconds.
 
     Args:
         title: what is done.
         total: number of jobs.
         missing: how many of them are still to be done.
+        cost: of these, in any unit; None: 1 each.
+        beside: cost of the jobs that run beside the first.
     """
 
-    def __init__(self, title: str, total: int, missing: int) -> None:
+    def __init__(self, title: str, total: int, missing: int, cost: float | None = None, beside: float = 0.0) -> None:
         self.title, self.total, self.missing, self.done = title, total, missing, 0
+        self._cost, self._spent = float(missing if cost is None else cost), 0.0
+        self._begun_half = beside / 2  # when a job is finished, those beside it are half done on average
         self._bar: Any = None
+        self._ended = threading.Event()
         if sys.stderr.isatty():
             from rich import progress as bars
             from rich.console import Console
 
-            columns = (bars.TextColumn("{task.description}"), bars.BarColumn(), bars.MofNCompleteColumn())
-            times = (bars.TimeElapsedColumn(), bars.TimeRemainingColumn())
-            self._bar = bars.Progress(*columns, *times, transient=True, console=Console(stderr=True))
-            self._task = self._bar.add_task(title, total=total, completed=total - missing)
+            done = (bars.TextColumn("{task.description}"), bars.BarColumn(), bars.MofNCompleteColumn())
+            times = (bars.TimeElapsedColumn(), bars.TextColumn("{task.fields[left]}"))
+            self._bar = bars.Progress(*done, *times, transient=True, console=Console(stderr=True))
+            self._task = self._bar.add_task(title, total=total, completed=total - missing, left="")
 
     def __enter__(self) -> "Progress":
-        self._begun = time.monotonic()
+        self._begun = self._said = time.monotonic()
         if self._bar is not None:
             self._bar.start()
-        elif self.missing < self.total:
+            return self
+        if self.missing < self.total:
             print(f"{self.title}: {self.total - self.missing}/{self.total} were finished before", file=sys.stderr)
+        threading.Thread(target=self._watch, daemon=True).start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._ended.set()
         if self._bar is not None:
             self._bar.stop()
 
-    def advance(self, what: str) -> None:
-        """Report a finished job."""
+    def advance(self, what: str, cost: float = 1.0) -> float:
+        """Report a finished job of this cost; returns the seconds that are left, about."""
         self.done += 1
+        self._spent += cost
+        left = self._say(what)
         if self._bar is not None:
-            self._bar.advance(self._task)
-            return
-        gone = time.monotonic() - self._begun
-        left = gone / self.done * (self.missing - self.done)
-        count = f"{self.total - self.missing + self.done}/{self.total}"
-        print(f"{self.title}: {count} {what} ({_clock(gone)}, {_clock(left)} left)", file=sys.stderr, flush=True)
+            self._bar.update(self._task, advance=1, left=f"{_clock(left)} left")
+        return left
+
+    def _say(self, what: str) -> float:
+        """Print a line, unless there is a bar; returns the seconds that are left at the speed so far, NaN at first."""
+        self._said = time.monotonic()
+        gone, rest, left = self._said - self._begun, self._cost - self._spent, nan
+        half = min(self._begun_half, rest / 2)
+        if self.done:
+            left = gone * (rest - half) / (self._spent + half)
+        if self._bar is None:
+            count = f"{self.total - self.missing + self.done}/{self.total}"
+            times = _clock(gone) + ("" if isnan(left) else f", about {_clock(left)} left")
+            print(f"{self.title}: {count} {what} ({times})", file=sys.stderr, flush=True)
+        return left
+
+    def _watch(self) -> None:
+        """Say something where no job was finished for a while."""
+        while not self._ended.wait(1):
+            if time.monotonic() - self._said >= QUIET_SECONDS:
+                self._say("finished")
+
+
+def in_words(seconds: float) -> str:
+    """A time, such as "20 seconds" or "3 minutes"."""
+    if seconds < 90:
+        return f"{max(round(seconds, -1), 10):.0f} seconds"
+    return f"{seconds / 60:.0f} minutes" if seconds < 90 * 60 else f"{seconds / 3600:.1f} hours"
 
 
 def _clock(seconds: float) -> str:

@@ -27,7 +27,7 @@ def test_results_come_in_the_order_of_the_jobs(processes: int, tmp_path: Path, c
     assert [result["square"] for result in found] == [25, 4, 81, 16]
     own = {result["process"] for result in found} == {os.getpid()}
     assert own == (processes == 1)
-    lines = capsys.readouterr().err.splitlines()
+    lines = [line for line in capsys.readouterr().err.splitlines() if " finished " not in line]  # a slow machine's
     assert len(lines) == 4
     assert lines[-1].startswith("squares: 4/4 ")
     assert lines[-1].endswith(" 0:00:00 left)")
@@ -98,8 +98,8 @@ def test_progress_says_what_is_done_and_left(
         progress.advance("b")
     assert capsys.readouterr().err.splitlines() == [
         "t: 6/10 were finished before",
-        "t: 7/10 a (1:01:01, 3:03:03 left)",
-        "t: 8/10 b (2:02:02, 2:02:02 left)",
+        "t: 7/10 a (1:01:01, about 3:03:03 left)",
+        "t: 8/10 b (2:02:02, about 2:02:02 left)",
     ]
 
 

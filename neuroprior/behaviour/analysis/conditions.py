@@ -18,6 +18,7 @@ from neuroprior.behaviour.analysis.condition_chains import SMOOTHING, ConditionC
 from neuroprior.behaviour.analysis.flat import FlatPlans, ranks
 from neuroprior.behaviour.analysis.permutation_design import PermutationDesign
 from neuroprior.behaviour.recorded_plans import RecordedPlans
+from neuroprior.plans.columns import listed
 from neuroprior.plans.plans import check_are_plans
 
 LEVEL = 0.05
@@ -115,8 +116,8 @@ class ConditionComparison:
         prediction: of actions from conditions and back; None if nothing could be tested.
         tests: by name, the p-value of each family, "bits" and "classifier", and the same corrected for the number of
             these tests (`neuroprior.behaviour.holm`).
-        p_value: of all tests together: Fisher's combination of their p-values, itself tested in the same permutations
-            (Pesarin and Salmaso 2010, nonparametric combination); NaN if nothing could be tested.
+        p_value: of all tests together: the smallest corrected one; NaN if nothing could be tested. So behaviour differs
+            just where one of the tests is significant.
         labellings: how many ways of giving blocks their conditions were compared, with the one observed.
         exact: whether these were all.
         smallest_p: the smallest p-value that is possible.
@@ -206,10 +207,9 @@ def compare_conditions(
     prediction, statistics["bits"], statistics["classifier"] = _predicted(
         chains, design, labellings, block.bincount().double()
     )
-    ranked = torch.stack([_shares_reaching(values) for values in statistics.values()])
-    p_values = ranked[:, 0].tolist()
+    p_values = [float(_shares_reaching(values)[0]) for values in statistics.values()]
     tests = dict(zip(statistics, zip(p_values, holm(p_values).tolist(), strict=True), strict=True))
-    p_value = float(_shares_reaching(-ranked.log().sum(0))[0])
+    p_value = min(corrected for _, corrected in tests.values())
     smallest = design.smallest_p(drawn)
     conclusive = smallest < LEVEL and len(design.units) >= ENOUGH_UNITS
     verdict = _verdict(design, names, tests, p_value, smallest, conclusive) + f" {design.odd}." * bool(design.odd)
@@ -432,9 +432,6 @@ def _verdict(
         return f"{units[0].upper()}{units[1:]} are too few for a verdict."
     between = f"between {names[0]} and {names[1]}" if len(names) == 2 else f"between the {len(names)} conditions"
     if p_value >= LEVEL:
-        return f"No difference {between} was found (p = {p_value:.2g}). {power}."
-    where = [name for name, (_, corrected) in tests.items() if corrected < LEVEL]
-    found = f"Behaviour differs {between} (p = {p_value:.2g})"
-    if where:
-        return f"{found}, by the tests of {', '.join(where)} (corrected). {power}."
-    return f"{found}, but it cannot be said in what: no single test is significant when corrected. {power}."
+        return f"No difference {between} was found (p = {p_value:.2g}, corrected). {power}."
+    where = listed([name for name, (_, corrected) in tests.items() if corrected < LEVEL])
+    return f"Behaviour differs {between} (p = {p_value:.2g}), by the tests of {where} (corrected)."

@@ -4,11 +4,12 @@ import inspect
 import shlex
 import sys
 from pathlib import Path
+from typing import Any
 
 from docstring_parser import parse
 from rich.console import Console
 
-from neuroprior.behaviour.report.document import show
+from neuroprior.behaviour.report.document import PAGE, Document, FigureKind, show, show_headline
 from neuroprior.behaviour.report.options import INPUTS, FitOptions, InputName, ModelName, ReadOptions
 from neuroprior.behaviour.report.plan_report import report
 from neuroprior.priors.ensembles.candidates import Effort
@@ -28,6 +29,7 @@ def plans(
     seed: int = 0,
     processes: int | None = None,
     dask: str | None = None,
+    figures: FigureKind | None = None,
     out: str = "runs/plans",
     reading: ReadOptions = ReadOptions(),  # noqa: B008
 ) -> None:
@@ -36,10 +38,21 @@ def plans(
     if typed[:1] not in (["plans"], ["report"]):  # called from Python
         program, typed = "__main__.py", ["plans", *plans]
     command = f"{program.replace('__main__.py', 'python -m eval')} {shlex.join(typed)}"
-    document = report(plans, out=out, priors=priors, test=test, skip=skip, fits=fits, reading=reading, command=command)
-    console = Console()
+    console, page = Console(), Path(out) / PAGE
+    shown = False
+
+    def show_first(document: Document) -> None:
+        nonlocal shown
+        if document.status and not shown:
+            show_headline(document, console)
+            console.print(f"report: {page}. {document.status}", highlight=False, markup=False, soft_wrap=True)
+            shown = True
+
+    print(f"reading {' '.join(plans)}", file=sys.stderr, flush=True)
+    given: dict[str, Any] = {"priors": priors, "test": test, "skip": skip, "fits": fits, "reading": reading}
+    document = report(plans, out=out, figures=figures, command=command, each=show_first, **given)
     show(document, console)
-    console.print(f"report: {Path(out) / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
+    console.print(f"report: {page}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _describe_options() -> str:

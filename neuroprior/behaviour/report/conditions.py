@@ -14,9 +14,11 @@ from neuroprior.behaviour.analysis.conditions import (
 )
 from neuroprior.behaviour.report import figures
 from neuroprior.behaviour.report.document import Column, table
+from neuroprior.behaviour.report.findings import Finding, p_words
 from neuroprior.behaviour.report.page import FigureBox, Section, Table
 from neuroprior.behaviour.report.part import LISTED, Part, action_names, group_names, p_text
 from neuroprior.behaviour.report.scores import Evaluation
+from neuroprior.plans.columns import listed
 
 DRAWN = 8  # features in the figure
 
@@ -43,18 +45,73 @@ def condition_section(found: Evaluation) -> Part | None:
     result = compare_conditions(found.plans, generator=torch.Generator().manual_seed(0))
     names = ["condition_tests", "conditions", "condition_blocks"]
     if result.prediction is None:
-        return Part(Section("Conditions", [result.verdict]), {name: pd.DataFrame() for name in names})
+        empty = {name: pd.DataFrame() for name in names}
+        return Part(Section("Conditions", [result.verdict]), empty, [result.verdict])
     actions, units = action_names(found.plans), _unit_names(result, found)
     tests, features = _tests(result), _features(result, actions)
     blocks = _blocks(result, result.prediction, units)
-    frames = dict(zip(names, (tests, features, blocks), strict=True))
+    frames = dict(zip(names, (tests, features.drop(columns="parts"), blocks), strict=True))
     tables = [
         _test_table(result, tests),
         _feature_table(result, features),
         _block_table(result, result.prediction, blocks),
     ]
     box = _figure_box(result, features, units)
-    return Part(Section("Conditions", _text(result), tables, [box]), frames)
+    unit = found.recordings.unit if found.recordings is not None else ""
+    findings = [*_feature_findings(result, features, unit), *_prediction_findings(result, result.prediction)]
+    return Part(Section("Conditions", _text(result), tables, [box]), frames, [result.verdict], findings)
+
+
+SENTENCES = {
+    "transitions": "After {0}, {1} follows in {means}",
+    "durations": "A bout of {0} lasts {means} (geometric means)",
+    "actions": "Of all behaviours {0} is {means}",
+    "sequences": "Of all sequences of three {all} is {means}",
+}
+"""How the features of each family are said; `means` are those under each condition."""
+
+
+def _feature_findings(result: ConditionComparison, features: pd.DataFrame, unit: str) -> list[Finding]:
+    """A finding for each feature; `unit` is that of durations."""
+    two, found = len(result.condition_names) == 2, []
+    for row in features.to_dict("records"):
+        family, parts, of_time = row["family"], row["parts"], row["family"] == "durations"
+        scale, suffix = (1, f" {unit}".rstrip()) if of_time else (100, " %")
+        ordered = [*reversed(result.condition_names)] if two else result.condition_names  # the reference comes last
+        means = listed([f"{scale * row[f'mean, {name}']:.3g}{suffix} under {name}" for name in ordered])
+        p_corrected = max(row["corrected"], result.tests[family][1])
+        sentence = SENTENCES[family].format(*parts, all=" ".join(parts), means=means)
+        effect = low = high = None
+        if two:
+            effect, low, high = row["difference"], row["low"], row["high"]
+            by = f"{effect:.3g} times" if of_time else f"difference {100 * effect:+.3g} %"
+            bounds = f"{scale * low:{'' if of_time else '+'}.3g} to {scale * high:{'' if of_time else '+'}.3g}"
+            sentence += f": {by}, 95 % interval {bounds}"
+        sentence += f"; {p_words(p_corrected)}."
+        name = f"{family}: {row['feature']}"
+        p = float(row["p_value"])
+        found.append(
+            Finding(name, family, row["feature"], effect, low, high, p, p_corrected, row["significant"], sentence)
+        )
+    return found
+
+
+def _prediction_findings(result: ConditionComparison, prediction: ConditionPrediction) -> list[Finding]:
+    """What knowing the condition saves, and how often the condition is told from the sequences."""
+    mean, low, high, _ = prediction.gain
+    right, expected = 100 * prediction.accuracy, 100 * prediction.expected
+    item = result.design.item
+    saved = f"Knowing the condition saves {mean:.3g} bits per action, 95 % interval {low:.3g} to {high:.3g} over {item}"
+    told = f"From its sequences, {right:.0f} % of the {item} are given their own condition ({expected:.0f} % by chance)"
+    found = []
+    for name, effect, least, most, sentence in (
+        ("bits", mean, low, high, saved),
+        ("classifier", prediction.accuracy, None, None, told),
+    ):
+        p, corrected = result.tests[name]
+        starred, text = result.differs(name), f"{sentence}; {p_words(corrected)}."
+        found.append(Finding(name, name, TESTS[name], effect, least, most, p, corrected, starred, text))
+    return found
 
 
 def _text(result: ConditionComparison) -> list[str]:
@@ -71,9 +128,9 @@ def _text(result: ConditionComparison) -> list[str]:
         f" are. {'All' if result.exact else 'Random'} labellings that were compared, with the observed one:"
         f" {result.labellings:,}." + f" {left} {item} that are not under every condition were left out." * (left > 0),
         "Families of features are tested by their most different feature (Westfall and Young); the tests are corrected"
-        " for their number (Holm), and all of them are combined into one (p of the first sentence; Fisher's"
-        " combination in the same permutations). A star marks a feature that is significant, corrected for its family,"
-        " in a family that is. Rates of rare features are smoothed towards those of all.",
+        " for their number (Holm). Behaviour differs where one of them is significant. A star marks a feature that is"
+        " significant, corrected for its family, in a family that is. Rates of rare features are smoothed towards those"
+        " of all.",
     ]
 
 
@@ -121,6 +178,7 @@ def _features(result: ConditionComparison, actions: list[str]) -> pd.DataFrame:
         part = pd.DataFrame({"family": family.name, "place": range(len(family.features))})
         spelled = [joint.join(actions[action] for action in own) for own in family.features.tolist()]
         part["feature"] = [FAMILIES[family.name].format(own) for own in spelled]
+        part["parts"] = [[actions[action] for action in own] for own in family.features.tolist()]
         for name, *own in zip(result.condition_names, family.means, family.low, family.high, strict=True):
             for what, values in zip(("mean", "low", "high"), own, strict=True):
                 part[f"{what}, {name}"] = of_time(values.numpy())

@@ -3,11 +3,12 @@
 Needs pandas, matplotlib, jinja2 and rich (`neuroprior[report]`).
 """
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pandas as pd
 import rich.table
@@ -18,9 +19,12 @@ from rich.markup import escape
 from rich.text import Text
 
 from neuroprior._files import read_json, versions, write_json, written_whole
+from neuroprior.behaviour.report.findings import Sentence
 from neuroprior.behaviour.report.page import Section, Table, write_page
 
 Column = str | Callable[[Any], str]
+
+FigureKind = Literal["pdf", "svg", "png"]
 
 RESULTS, PAGE = "results.json", "report.html"
 """Files of a document, beside those of its frames."""
@@ -42,6 +46,8 @@ class Document:
         command: the command line that makes them again.
         results: further JSON values for `results.json`.
         keys: the name in `results.json` of a frame, where it is another.
+        headline: the findings as sentences, in place of a lead.
+        status: what is still to come, above all else; "" where it is whole.
 
     Example:
         >>> Document(
@@ -58,6 +64,13 @@ class Document:
     command: str = ""
     results: Mapping[str, Any] = field(default_factory=dict)
     keys: Mapping[str, str] = field(default_factory=dict)
+    headline: Sequence[Sentence] = ()
+    status: str = ""
+
+    @property
+    def said(self) -> list[str]:
+        """The sentences at the top."""
+        return [one.sentence for one in self.headline] or [self.lead]
 
     @property
     def tables(self) -> dict[str, pd.DataFrame]:
@@ -98,7 +111,14 @@ def show(document: Document, console: Console) -> None:
     for section in document.sections:
         for table in section.tables:
             console.print(printed(table.title or section.title, table))
-    console.print(document.lead, highlight=False, markup=False)
+    show_headline(document, console)
+
+
+def show_headline(document: Document, console: Console) -> None:
+    """Print the sentences at the top."""
+    mark = "- " if len(document.said) > 1 else ""
+    for sentence in document.said:
+        console.print(f"{mark}{sentence}", highlight=False, markup=False)
 
 
 def check_place(folder: Path, frames: Iterable[str], keys: Mapping[str, str] = {}) -> None:
@@ -144,13 +164,16 @@ def write_document(document: Document, folder: Path) -> None:
     write_json(folder / RESULTS, results_of(document))  # before the tables: it says that they are its own
     write_frames(folder, document.frames)
     shown = {**document.settings, **{f"version: {name}": number for name, number in versions().items()}}
-    write_page(folder / PAGE, document.title, document.lead, document.sections, shown, document.command)
+    top = document.said
+    write_page(folder / PAGE, document.title, top, document.sections, shown, document.command, document.status)
 
 
 def results_of(document: Document) -> dict[str, Any]:
     """What `results.json` holds: the rows of each frame, further results, settings and versions."""
     rows = {document.keys.get(name, name): records(frame) for name, frame in document.frames.items()}
-    return {**rows, **document.results, "settings": dict(document.settings), "versions": versions()}
+    headline = [asdict(one) for one in document.headline]
+    made = {"headline": headline, **document.results, "settings": dict(document.settings), "versions": versions()}
+    return {**rows, **made}
 
 
 def write_frames(folder: Path, frames: Mapping[str, pd.DataFrame]) -> None:
@@ -164,11 +187,13 @@ def write_frames(folder: Path, frames: Mapping[str, pd.DataFrame]) -> None:
             frame.to_csv(file, index=False, lineterminator="\n")
 
 
-def write_figures(folder: Path, figures: Mapping[str, Figure]) -> None:
-    """Write each figure as `NAME.png`."""
+def write_figures(folder: Path, figures: Mapping[str, Figure], kind: FigureKind = "png") -> None:
+    """Write each figure as `NAME.png`, `.pdf` or `.svg`; the folder is made if it is not there."""
+    folder.mkdir(parents=True, exist_ok=True)
     for name, figure in figures.items():
-        with written_whole(folder / f"{name}.png", "wb") as file:
-            figure.savefig(file, format="png", dpi=150, bbox_inches="tight", facecolor="white")
+        with written_whole(folder / f"{name}.{kind}", "wb") as file, warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+            figure.savefig(file, format=kind, dpi=150, bbox_inches="tight", facecolor="white")
 
 
 def records(frame: pd.DataFrame) -> list[dict[str, Any]]:

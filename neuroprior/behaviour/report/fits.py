@@ -47,6 +47,12 @@ KINDS = (COMBINED, "stacked", "transformer", "gru", "gru-lags", "lags", "counts"
 LAGS = ("lags", "gru-lags")
 """Jobs of the information by lag, by counts and by a GRU; of one fold only."""
 
+COUNTS = ("counts", "lags")
+"""Jobs that need no network, and take seconds."""
+
+COSTS = {COMBINED: 6.0, "stacked": 3.0, "transformer": 5.0, "gru": 2.0, "gru-lags": 3.0}
+"""About how long jobs with networks take, compared with one another."""
+
 COUNTED = "markov"
 """The count-based model of the information by lag; the other is the GRU."""
 

@@ -121,13 +121,15 @@ class Section:
     """A part of a page with a line in its contents: paragraphs, then figures, then tables.
 
     Where `beside` is set, figures stand beside one another as far as there is room: small ones, up to 3 inches wide.
+    A `folded` section shows its title alone, until a reader opens it.
 
     Attributes:
         title: its line in the contents.
         text: paragraphs.
         tables: in order.
         figures: in order.
-        beside: see above.
+        beside, folded: see above.
+        files: names of the files that have its tables and figures, beside the page.
 
     Example:
         >>> Section("Scores", ["Two priors."], tables=[Table(["prior", "bits"], [["uniform", "2.00"]])]).title
@@ -139,10 +141,18 @@ class Section:
     tables: Sequence[Table] = ()
     figures: Sequence[FigureBox] = ()
     beside: bool = False
+    folded: bool = False
+    files: Sequence[str] = ()
 
 
 def write_page(
-    path: Path, title: str, lead: str, sections: Sequence[Section], settings: Mapping[str, Any], command: str = ""
+    path: Path,
+    title: str,
+    lead: Sequence[str],
+    sections: Sequence[Section],
+    settings: Mapping[str, Any],
+    command: str = "",
+    status: str = "",
 ) -> None:
     """Write a page as one HTML file, whole or not at all; the same page gives the same bytes.
 
@@ -166,6 +176,7 @@ def write_page(
         for s, section in enumerate(sections, 1)
     ]
     page = {"title": title, "lead": lead, "sections": sections, "settings": settings, "command": command}
+    page["status"] = status
     text = environment.get_template("page.html.j2").render(page=page, drawings=drawings)
     write_whole(path, text.encode())
 

@@ -1,10 +1,12 @@
 """A section of a report on plans with its tables, and what sections share: names, texts of p-values, limits."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import pandas as pd
 from torch import Tensor
 
+from neuroprior.behaviour.report.findings import Finding
 from neuroprior.behaviour.report.page import Section
 from neuroprior.plans import Plans
 
@@ -15,10 +17,12 @@ SIGNIFICANT = 0.05
 
 
 class Part(NamedTuple):
-    """A section, and its tables of results by name."""
+    """A section, its tables of results by name, what it answers in a sentence each, and all that it tested."""
 
     section: Section
     frames: dict[str, pd.DataFrame]
+    verdicts: Sequence[str] = ()
+    findings: Sequence[Finding] = ()
 
 
 def action_names(plans: Plans) -> list[str]:

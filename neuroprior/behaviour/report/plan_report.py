@@ -1,25 +1,39 @@
 """The report on plans: which models predict them best, how far back they reach, what is typical of them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from time import monotonic
+from typing import Any, NamedTuple
 
 import torch
 
 from neuroprior._checks import check_count
-from neuroprior._jobs import Progress
+from neuroprior._jobs import Progress, in_words
 from neuroprior._threads import one_thread
 from neuroprior.behaviour.durations.past_durations import PastDurations
 from neuroprior.behaviour.reading.read import read_recordings
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.recordings import Recordings
-from neuroprior.behaviour.report.document import Document, check_place, write_document
-from neuroprior.behaviour.report.fits import ACTIONS, CONTEXT, DURATIONS, LAGS, OF_FEATURES, Design, counted
+from neuroprior.behaviour.report.document import Document, FigureKind, check_place, write_document, write_figures
+from neuroprior.behaviour.report.findings import Sentence, headline
+from neuroprior.behaviour.report.fits import (
+    ACTIONS,
+    CONTEXT,
+    COSTS,
+    COUNTS,
+    DURATIONS,
+    LAGS,
+    OF_FEATURES,
+    Design,
+    Job,
+    counted,
+)
 from neuroprior.behaviour.report.options import Files, FitOptions, ReadOptions, check_choices, is_recording, name_files
+from neuroprior.behaviour.report.part import Part
 from neuroprior.behaviour.report.scores import Evaluation, cross_validation, evaluate, evaluate_saved, jobs
-from neuroprior.behaviour.report.sections import SECTIONS, describe
+from neuroprior.behaviour.report.sections import OF_MODELS, SECTIONS, describe
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
 from neuroprior.plans.plans import AnyPlans
@@ -32,6 +46,9 @@ MOST_ACTIONS = 10_000
 
 KEYS = {"plans": "rows"}
 """The keys of tables in `results.json`, where they are others than the names of the CSV files."""
+
+SECONDS_A_STATUS = 60
+"""How often the page says anew how long networks take."""
 
 FOLDS = 5
 """Folds where their number is not given; fewer where there are fewer groups."""
@@ -47,9 +64,11 @@ def report(
     fits: FitOptions = FitOptions(),  # noqa: B008
     reading: ReadOptions | None = None,
     sections: Sequence[str] = tuple(SECTIONS),
+    figures: FigureKind | None = None,
     command: str = "",
+    each: Callable[[Document], None] = lambda document: None,
 ) -> Document:
-    """Report on plans: which models predict them best, how far back they reach, what is typical of them.
+    """Report on plans: what differs between conditions, which models predict them best, what is typical of them.
 
     Args:
         plans: recordings, their files (see `neuroprior.behaviour.read`), or executed plans; a file of plans, `.npz`,
@@ -62,7 +81,9 @@ def report(
         fits: which models are fitted, and how.
         reading: how files are read; None for plans in memory.
         sections: which to make, of `neuroprior.behaviour.report.sections.SECTIONS`; all by default.
+        figures: also write each figure to `figures` below `out`, for papers: pdf, svg or png.
         command: the command line that makes the report again, for the page.
+        each: is called with what needs no network as soon as this is written, and again as more is there.
 
     Returns:
         All that is printed and written; its `tables`, of which that of models is "plans", and its `figures`, such as
@@ -92,17 +113,47 @@ def report(
         plans = read_recordings(plans, reading)
     if priors is None:
         _check_other_files(files, test)
-        found = _cross_validate(plans, test, skip, fits, reading, out, "lags" in sections)
+        stages = _cross_validate(plans, test, skip, fits, reading, out, "lags" in sections)
     else:
         if given := fits.changed() + ["test"] * (test is not None):
             names = ", ".join(f"`{name}`" for name in given)
             raise ValueError(f"{names} must be left out where `priors` are given, which are not fitted.")
-        found = _score_saved(plans, priors, skip, reading)
-    found = replace(found, recordings=plans if isinstance(plans, Recordings) else None)
-    document = _document(found, sections, file, command)
-    if out is not None:
-        write_document(document, Path(out))
+        stages = iter([_Stage(_score_saved(plans, priors, skip, reading), tuple(SECTIONS), "")])
+    recordings = plans if isinstance(plans, Recordings) else None
+    made, document, written = dict[str, Part | None](), None, monotonic()
+    try:
+        for stage in stages:
+            found = replace(stage.found, recordings=recordings)
+            if document is None or stage.sections:
+                made |= _made(found, [name for name in SECTIONS if name in sections and name in stage.sections])
+                document = _document(found, made, file, command, figures)
+            elif monotonic() - written < SECONDS_A_STATUS:
+                continue
+            document, written = replace(document, status=stage.status), monotonic()
+            if out is not None:
+                _write(document, Path(out), figures)
+            each(document)
+    except KeyboardInterrupt:
+        if document is not None and out is not None:
+            stopped = "Interrupted: networks or modes are missing. The same command goes on."
+            _write(replace(document, status=stopped), Path(out), figures)
+        raise
+    assert document is not None
     return document
+
+
+def _write(document: Document, folder: Path, figures: FigureKind | None) -> None:
+    write_document(document, folder)
+    if figures is not None and not document.status:
+        write_figures(folder / "figures", document.figures, figures)
+
+
+class _Stage(NamedTuple):
+    """What was found so far, the sections that can be made of it, and what is still to come."""
+
+    found: Evaluation
+    sections: Sequence[str]
+    status: str
 
 
 def _score_saved(
@@ -132,8 +183,11 @@ def _cross_validate(
     reading: ReadOptions,
     out: str | Path | None,
     with_lags: bool,
-) -> Evaluation:
-    """Fit models to plans, and score them on those held out, or on `test`; finished fits are kept in `out`."""
+) -> Iterator[_Stage]:
+    """Fit models to plans, and score them on those held out, or on `test`; finished fits are kept in `out`.
+
+    Counts come first; then what needs no more than these can be shown.
+    """
     if test is not None and fits.folds is not None:
         raise ValueError("`folds` must be left out where there are `test` plans, for which nothing is held out.")
     whole, empty = _with_actions(plans, reading)
@@ -152,23 +206,42 @@ def _cross_validate(
     if with_lags:
         kinds += LAGS if set(kinds) != {"counts"} else LAGS[:1]
     inputs = _inputs(fits, kinds, learned, scored)
-    left = int(counted(scored, skip, cut).sum())
-    if left < FEWEST_UNITS:
+    scorable = int(counted(scored, skip, cut).sum())
+    if scorable < FEWEST_UNITS:
         raise ValueError(
-            f"`skip` must leave at least {FEWEST_UNITS} actions to score, got {skip}, which leaves {left}."
+            f"`skip` must leave at least {FEWEST_UNITS} actions to score, got {skip}, which leaves {scorable}."
         )
+    settings: dict[str, Any] = {"models": ", ".join(kinds)}
+    todo = jobs(design, kinds, inputs)
+    counts, networks = ([job for job in todo if (job.kind in COUNTS) == first] for first in (True, False))
+
+    def evaluated(done: list[Job]) -> Evaluation:
+        found = evaluate(learned, other, design, done, run.results(done))
+        more: dict[str, Any] = {} if fits.modes is None else {"modes": sorted(set(fits.modes))}
+        more |= {"plans without actions, left out": empty} if empty else {}
+        more |= {} if test is None else {"test": _name(test)}
+        return replace(found, plans=whole, settings=settings | found.settings | more)
+
     if out is not None:
         Path(out).mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory() as temporary:
         run = cross_validation(Path(out or temporary), learned, other, design)
-        todo = jobs(design, kinds, inputs)
-        results = run.do(todo, processes=fits.processes, dask=fits.dask, title="fits")
-    found = evaluate(learned, other, design, todo, results)
-    settings: dict[str, Any] = {"models": ", ".join(kinds)} | found.settings
-    settings |= {} if fits.modes is None else {"modes": sorted(set(fits.modes))}
-    settings |= {"plans without actions, left out": empty} if empty else {}
-    settings |= {} if test is None else {"test": _name(test)}
-    return replace(found, plans=whole, settings=settings)
+        for _ in run.each(counts, processes=1, dask=fits.dask, title="counts"):
+            pass
+        found, modes = evaluated(counts), "" if fits.modes is None else "hidden modes"
+        later = ["networks"] * bool(networks) + [modes] * bool(modes)
+        at_once = [name for name in SECTIONS if name != "modes"]
+        yield _Stage(found, at_once, f"Still running: {' and '.join(later)}." if later else "")
+        if networks:
+            how: dict[str, Any] = {"processes": fits.processes, "dask": fits.dask, "title": "networks"}
+            for seconds in run.each(networks, cost=lambda job: COSTS[job.kind], **how):
+                yield _Stage(
+                    found, (), f"Still running: {' and '.join(later)}; networks about {in_words(seconds)} more."
+                )
+            found = evaluated(todo)
+            yield _Stage(found, OF_MODELS, f"Still running: {modes}." if modes else "")
+        if modes:
+            yield _Stage(found, ("modes",), "")
 
 
 def _inputs(fits: FitOptions, kinds: Sequence[str], learned: RecordedPlans, scored: RecordedPlans) -> list[str]:
@@ -186,40 +259,60 @@ def _inputs(fits: FitOptions, kinds: Sequence[str], learned: RecordedPlans, scor
     return found
 
 
-def _document(found: Evaluation, sections: Sequence[str], file: str, command: str) -> Document:
-    made = []
+def _made(found: Evaluation, names: Sequence[str]) -> dict[str, Part | None]:
+    """These sections."""
+    made = {}
     # Its steps are small: on a busy machine several threads would wait for one another.
-    with Progress("report", len(sections), len(sections)) as progress, one_thread():
-        for name in [name for name in SECTIONS if name in sections]:
-            part = SECTIONS[name](found)
-            made += [] if part is None else [part]
+    with Progress("report", len(names), len(names)) as progress, one_thread():
+        for name in names:
+            made[name] = SECTIONS[name](found)
             progress.advance(name)
+    return made
+
+
+def _document(
+    found: Evaluation, made: Mapping[str, Part | None], file: str, command: str, figures: FigureKind | None
+) -> Document:
+    """The sections that were made, in the order of the page, below what they found."""
+    parts = [part for name in SECTIONS if (part := made.get(name)) is not None]
+    findings = [finding for part in parts for finding in part.findings]
+    verdicts = [verdict for part in parts for verdict in part.verdicts]
     return Document(
-        title=f"Plans in {file}" if file else "Plans",
-        lead=" ".join([_lead(found), *(part.section.text[0] for part in made if part.section.title == "Conditions")]),
-        sections=[part.section for part in made],
-        frames={name: frame for part in made for name, frame in part.frames.items()},
+        title=f"Report on {file}" if file else "Report",
+        lead="",
+        sections=[replace(part.section, files=_files(part, figures)) for part in parts],
+        frames={name: frame for part in parts for name, frame in part.frames.items()},
         settings=found.settings,
         command=command,
         results={
-            "reference": found.reference[1],
+            "reference": None if found.reference is None else found.reference[1],
             "unit": found.unit,
             "file": {"name": file, **describe(found.plans)},
+            "findings": [finding.row() for finding in findings],
         },
         keys=KEYS,
+        headline=headline([*map(Sentence, [*verdicts, *_scored(found)])], findings),
     )
 
 
-def _lead(found: Evaluation) -> str:
-    """The finding: the model that takes the fewest bits, which is called the best where there are enough units."""
+def _files(part: Part, figures: FigureKind | None) -> list[str]:
+    """The files of a section's tables and figures."""
+    tables = [f"{name}.csv" for name, frame in part.frames.items() if len(frame)]
+    return tables + [f"figures/{box.name}.{figures}" for box in part.section.figures if figures is not None]
+
+
+def _scored(found: Evaluation) -> list[str]:
+    """The model that takes the fewest bits, which is called the best where there are enough units."""
+    if not found.models:
+        return []
     learned = found.settings.get("training data", {})
     same = "; ".join(
         f"{name} has learned from {number:,} of the {len(found.plans):,} plans" for name, number in learned.items()
     )
-    return f"{_finding(found)} These are training data: {same}." if learned else _finding(found)
+    return [f"{_best(found)} These are training data: {same}." if learned else _best(found)]
 
 
-def _finding(found: Evaluation) -> str:
+def _best(found: Evaluation) -> str:
     bits, low, high, _ = found.best.score.bits_per_action()
     interval = f"(95 % interval {low:.3f} to {high:.3f} over {found.unit})"
     if not found.too_few:

@@ -75,7 +75,7 @@ class Evaluation:
     scored: RecordedPlans  # those on which models were scored, N of them
     mask: Tensor  # [N, L] bool: their actions that count
     models: Sequence[Model]  # in the order of the main table
-    reference: tuple[Model, str]  # the model that the others are compared with, and its name in the report
+    reference: tuple[Model, str] | None  # the model that the others are compared with, and its name; None: no models
     first_fold: RecordedPlans  # the plans that are held out in the first fold
     gains: pd.DataFrame  # the information by lag that models give
     settings: dict[str, Any]  # how it was made
@@ -98,6 +98,7 @@ class Evaluation:
 
     def table(self) -> pd.DataFrame:
         """A row a model: bits, nats and perplexity with intervals, and the paired difference from the reference."""
+        assert self.reference is not None
         rows = []
         for model in self.models:
             bits, low, high, _ = model.score.bits_per_action()
@@ -162,10 +163,10 @@ def evaluate(
                     bits[index] = torch.from_numpy(part["bits"])
                 models.append(Model(name, inputs, how, bits, score_bits(name, inputs, bits, scored, mask)))
     models.sort(key=lambda model: ([*WITH].index(model.inputs), ORDERED.index(model.name)))
-    best = min(models, key=lambda model: model.cost)
+    best = min(models, key=lambda model: model.cost, default=None)
     gains.sort(key=lambda row: (row["context"] == CONTEXT, row["model"] != COUNTED))
     table = pd.DataFrame(gains)
-    reference = best, f"{best.name} ({best.inputs})"
+    reference = None if best is None else (best, f"{best.name} ({best.inputs})")
     return Evaluation(plans, scored, mask, models, reference, scored[held_out[0]], table, asdict(design))
 
 

@@ -98,8 +98,10 @@ def describe(plans: RecordedPlans) -> dict[str, Any]:
     }
 
 
-def score_section(found: Evaluation) -> Part:
-    """The main table."""
+def score_section(found: Evaluation) -> Part | None:
+    """The main table; None where no model was scored yet."""
+    if found.reference is None:
+        return None
     scores = found.table()
     more = scores["more_high"] - scores["more"]
     learned, saved = found.settings.get("training data", {}), "priors" in found.settings
@@ -357,6 +359,10 @@ SECTIONS: dict[str, Callable[[Evaluation], Part | None]] = {
     "drift": drift_section,
 }
 """By name, in the order of the page."""
+
+
+OF_MODELS = ("scores", "lags", "durations", "drift")
+"""Sections that say more when networks were fitted."""
 
 
 def _no_verdict(few: str) -> str:

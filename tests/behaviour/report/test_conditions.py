@@ -8,6 +8,7 @@ import torch
 from neuroprior import Plans
 from neuroprior.behaviour import compare_conditions
 from neuroprior.behaviour.report.conditions import DRAWN, condition_section
+from neuroprior.behaviour.report.document import results_of
 from neuroprior.behaviour.report.part import LISTED, Part
 from neuroprior.behaviour.report.plan_report import report
 from neuroprior.behaviour.report.scores import evaluate_saved
@@ -40,7 +41,7 @@ def changed(conditions, length: int = 80, **more: object) -> Plans:
 )
 def test_the_tables_hold_what_was_found(conditions):
     plans = changed(conditions)
-    section, frames = section_of(plans)
+    section, frames, *_ = section_of(plans)
     found = compare_conditions(plans, generator=seeded(0))
     assert section.text[0] == found.verdict
     tests = frames["condition_tests"].set_index("test")
@@ -65,7 +66,7 @@ def test_the_tables_hold_what_was_found(conditions):
 
 
 def test_stars_and_limits_of_the_printed_tables():
-    section, frames = section_of(changed(between(12)))
+    section, frames, *_ = section_of(changed(between(12)))
     tests, features, predicted = section.tables
     assert tests.rows[0][0] == "all tests together"
     assert all(row[-1].endswith("*") == (float(row[-1].strip("*")) < 0.05) for row in tests.rows[1:])
@@ -79,7 +80,7 @@ def test_stars_and_limits_of_the_printed_tables():
 
 def test_units_are_counted_by_their_condition_and_by_the_one_predicted():
     """Short plans without an effect, so that not as many of one condition are taken for the other as the reverse."""
-    section, frames = section_of(study(0, between(9, 1), 12, 3, habit=0.2))
+    section, frames, *_ = section_of(study(0, between(9, 1), 12, 3, habit=0.2))
     blocks = frames["condition_blocks"]
     pairs = [*zip(blocks["condition"], blocks["classified"], strict=True)]
     printed = section.tables[2]
@@ -91,12 +92,33 @@ def test_units_are_counted_by_their_condition_and_by_the_one_predicted():
 
 def test_a_report_has_the_section(tmp_path):
     made = report(changed(between(12)), fits=QUICK_IN_TWO, out=tmp_path, sections=["file", "conditions"])
-    assert made.lead.endswith(compare_conditions(changed(between(12)), generator=seeded(0)).verdict)
+    result = compare_conditions(changed(between(12)), generator=seeded(0))
+    assert made.said[0] == result.verdict
     names = ["condition_tests", "conditions", "condition_blocks"]
     assert {*names} <= {*made.tables}
     assert all((tmp_path / f"{name}.csv").exists() for name in names)
     assert "conditions" in made.figures
-    assert any("the smallest possible p is 0.0022" in text for text in made.sections[-1].text)
+    assert result.smallest_p == pytest.approx(0.0022, abs=1e-4)
+
+
+@pytest.mark.parametrize("change", [0, 0.2, 1])
+def test_the_headline_says_exactly_what_is_starred(change):
+    """Each starred finding is said or named at the top, and nothing else; the verdict agrees."""
+    some = torch.rand(48, generator=seeded(2)) < change
+    plans = changed(between(12))
+    alike = plans.actions[torch.randperm(48, generator=seeded(3))]
+    plans = replace(plans, actions=torch.where(some[:, None], plans.actions, alike))
+    results = results_of(report(plans, fits=QUICK_IN_TWO, sections=["conditions"]))
+    starred = [one for one in results["findings"] if one["starred"]]
+    said = [one["finding"] for one in results["headline"] if one["finding"]]
+    assert all(one["starred"] == (one["p_corrected"] < 0.05) for one in results["findings"])
+    assert {*said} <= {one["id"] for one in starred}
+    rest = [one["feature"] for one in starred if one["id"] not in said]
+    last = results["headline"][-1]["sentence"]
+    assert all(feature in last for feature in rest)
+    assert bool(rest) == last.startswith("Starred, too")
+    assert results["headline"][0]["sentence"].startswith("Behaviour differs" if starred else "No difference")
+    assert len(results["headline"]) <= 8
 
 
 def test_without_conditions_there_is_no_section_and_with_one_it_says_why():
@@ -110,7 +132,7 @@ def test_without_conditions_there_is_no_section_and_with_one_it_says_why():
 def test_plans_without_groups_or_names_that_are_those_of_columns():
     names = ["p", "condition: feature"]
     plans = replace(changed(between(12, 1), condition_names=names), group=None)
-    section, frames = section_of(plans)
+    section, frames, *_ = section_of(plans)
     assert frames["condition_blocks"]["plan"].tolist() == [f"plan {number}" for number in range(12)]
     assert section.tables[1].headings == [
         "feature",
@@ -123,7 +145,7 @@ def test_plans_without_groups_or_names_that_are_those_of_columns():
 def test_the_figure_shows_the_features_that_differ_most():
     """With the values of units, those of durations as geometric means, and the means of the table."""
     plans = changed(within(8))
-    section, frames = section_of(plans)
+    section, frames, *_ = section_of(plans)
     cells, features = section.figures[0].figure.axes, frames["conditions"][:DRAWN]
     assert [axes.get_title(loc="left").rstrip("*") for axes in cells] == features["feature"].tolist()
     found = compare_conditions(plans, generator=seeded(0))

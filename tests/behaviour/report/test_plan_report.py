@@ -61,7 +61,7 @@ def test_test_plans_are_scored_and_nothing_is_held_out_of_the_others(num):
     assert min(costs) - 1e-3 <= bits(made, "markov-0") <= max(costs) + 1e-3
     assert made.settings["folds"] == 1
     assert made.settings["cut"] == (num == 1)
-    assert ("1 plan is too few for a verdict" in made.lead) == (num == 1)
+    assert ("1 plan is too few for a verdict" in " ".join(made.said)) == (num == 1)
     assert made.results["unit"] == ("parts of the plan" if num == 1 else "plans")
 
 
@@ -136,7 +136,7 @@ def test_saved_priors_are_scored_on_the_actions_that_count_and_known_plans_are_m
     folders = [str(tmp_path / name) for name in ("one", "two")]
     made = report(plans, priors=folders, skip=skip, sections=["scores"])
     assert made.settings["training data"] == {folders[0]: 4}
-    assert f"{folders[0]} has learned from 4 of the 12 plans" in made.lead
+    assert f"{folders[0]} has learned from 4 of the 12 plans" in " ".join(made.said)
     marked = [row[0].endswith("(training data)") for row in made.sections[0].tables[0].rows]
     assert marked == [True, False]
     prior = MarkovPrior(3, 1).fit(others.actions)

@@ -98,7 +98,7 @@ def test_what_is_asked_for_is_done(made):
 
 def test_the_lead_names_the_best_model(made):
     best = made.tables["plans"].sort_values("bits_per_action").iloc[0]
-    assert made.lead == (
+    assert " ".join(made.said) == (
         f"The best model, {best.model}, takes {best.bits_per_action:.3f} bits per action"
         f" (95 % interval {best.low:.3f} to {best.high:.3f} over groups)."
     )
@@ -111,7 +111,7 @@ def test_plans_in_memory_and_in_a_file_have_the_same_report(tmp_path, made):
     write_plans(plans, tmp_path / "plans.npz")
     again = report(tmp_path / "plans.npz", sections=["scores"], out=tmp_path / "out", **ASKED)
     pd.testing.assert_frame_equal(again.tables["plans"], made.tables["plans"])
-    assert (made.title, again.title) == ("Plans", "Plans in plans.npz")
+    assert (made.title, again.title) == ("Report", "Report on plans.npz")
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.html", "results.json", "plans.csv", "folds"}
 
 
@@ -142,7 +142,7 @@ def test_what_cannot_be_reported_is_refused(options, fits, words):
 
 def verdicts(document: Document) -> str:
     """All that a report says in words, and all cells of its tables."""
-    texts = [document.lead]
+    texts = [" ".join(document.said)]
     for section in document.sections:
         texts += [*section.text, *(box.caption for box in section.figures)]
         for table in section.tables:
@@ -169,23 +169,23 @@ def test_few_groups_bear_no_verdict(number, enough):
     """Below five animals nothing is starred, ringed, dotted or called best; the numbers stand."""
     whole = report(animals(number), fits=QUICK_IN_TWO)
     said, few = verdicts(whole), f"{number} groups are too few for a verdict"
-    assert (few in whole.lead) != enough
-    assert ("The best model" in whole.lead) == enough
+    assert (few in " ".join(whole.said)) != enough
+    assert ("The best model" in " ".join(whole.said)) == enough
     assert ("*" in said) == enough
     assert ("significant" in said) == enough
     assert ("p" in said.split("\n")) == enough  # the heading of a column
     assert (marks(whole.figures["group_transitions"]) > 0) == enough
     assert said.count(few) == (0 if enough else 6)  # the lead, and each section that would draw one
     assert whole.tables["plans"]["low"].notna().all()
-    assert "over groups" in whole.lead
+    assert "over groups" in " ".join(whole.said)
 
 
 def test_parts_of_a_plan_are_not_plans():
     """A single long session is one: its parts have intervals, and bear no verdict."""
     (plan,) = markov_plans(markov_probs(3, 1, 0, 1.5), 1, 400, 1).actions
     found = report(Plans(plan[None], 3), fits=QUICK_IN_TWO)
-    assert "over parts of the plan" in found.lead
-    assert "1 plan is too few for a verdict" in found.lead
+    assert "over parts of the plan" in " ".join(found.said)
+    assert "1 plan is too few for a verdict" in " ".join(found.said)
     assert "*" not in verdicts(found)
 
 
