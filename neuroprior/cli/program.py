@@ -27,11 +27,13 @@ class Command(NamedTuple):
         target: `module:function`, imported only when the command is given.
         about: one line for the list of commands.
         raw: the function parses its arguments itself: it is called with the list of them.
+        slow: importing it takes seconds, so that something is said first, on standard error.
     """
 
     target: str
     about: str
     raw: bool = False
+    slow: bool = False
 
     def load(self) -> Callable[..., Any]:
         """Import the function."""
@@ -70,6 +72,8 @@ def run_commands(
         if name not in commands:
             raise ValueError(f"{name!r} is no command; there are {', '.join(commands)}")
         command = commands[name]
+        if command.slow and not {"-h", "--help"} & {*options}:
+            print(f"{program} {name}: starting", file=sys.stderr, flush=True)
         if command.raw:
             command.load()(options)
         else:

@@ -1,16 +1,25 @@
 """Which action follows which: first-order transitions, overall and in each group, and whether the groups differ."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
+import numpy as np
+import pandas as pd
 import torch
+from scipy.special import stdtrit
 from torch import Tensor
 
 from neuroprior._checks import check_sizes
 from neuroprior._random import generator_on
 from neuroprior.behaviour.analysis.flat import FlatPlans
+from neuroprior.behaviour.recorded_plans import RecordedPlans
+from neuroprior.behaviour.recordings import Recordings
 from neuroprior.plans import Plans
+
+if TYPE_CHECKING:
+    import networkx as nx
 
 FEWEST_PERMUTATIONS = 99
 """Permutations that are made whatever they cost."""
@@ -30,9 +39,11 @@ NUMBERS_AT_ONCE = 2**21
 Test = Literal["permutation", "none"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Transitions:
     """How often each action was followed by each other one, and whether groups differ in that.
+
+    Groups are those of the plans (subjects), or with `by` the levels of a factor.
 
     Attributes:
         counts: int64 `[A, A]`: how often each action (row) was followed by each action (column) within a plan.
@@ -48,6 +59,9 @@ class Transitions:
         test: "permutation" of the groups of whole plans; "none" if there are fewer than `FEWEST_DIVISIONS` ways of
             dividing the plans into such groups, or if no two groups are comparable.
         permutations: how many were made; 0 without any.
+        low, high: float64 `[1 + G, A, A]`: the 95 % interval of each probability, of all and then of each group: over
+            plans within a group, else over groups (subjects); NaN where there is one only.
+        action_names: A names; group_names: G of them.
     """
 
     counts: Tensor
@@ -58,6 +72,60 @@ class Transitions:
     cell_p_values: Tensor
     test: Test
     permutations: int
+    low: Tensor
+    high: Tensor
+    action_names: Sequence[str]
+    group_names: Sequence[str]
+
+    def __repr__(self) -> str:
+        """Return how many transitions there are of how many kinds, and the p-value."""
+        kinds, total = int((self.counts > 0).sum()), int(self.counts.sum())
+        tested = "" if self.test == "none" else f", p = {self.p_value:.2g}"
+        return f"Transitions({total:,} of {kinds:,} kinds, {len(self.group_names)} groups{tested})"
+
+    def frame(self) -> pd.DataFrame:
+        """Return a row for each transition that occurs, of all and of each group.
+
+        Columns: `group` ("all" for all), `from`, `to`, `count`, `probability`, `low`, `high`, `p_value` (corrected).
+        """
+        counts = torch.cat([self.counts[None], self.group_counts])
+        which, a, b = counts.nonzero(as_tuple=True)
+        probs = torch.cat([self.probs()[None], self.group_probs()])
+        p_values = torch.cat([torch.full_like(self.cell_p_values[:1], float("nan")), self.cell_p_values])
+        names, groups = np.array(self.action_names, dtype=object), np.array(["all", *self.group_names], dtype=object)
+        columns = {"group": groups[which.cpu()], "from": names[a.cpu()], "to": names[b.cpu()]}
+        numbers = (counts, probs, self.low, self.high, p_values)
+        named = zip(("count", "probability", "low", "high", "p_value"), numbers, strict=True)
+        return pd.DataFrame(columns | {name: values[which, a, b].cpu().numpy() for name, values in named})
+
+    def graph(self, group: str = "all") -> "nx.DiGraph":
+        """Return the transitions above chance as a networkx graph, for GraphML, Graphviz and other programs.
+
+        An edge is a transition whose interval lies above the share of its second action among all that follow another
+        action. Nodes have `count`; edges `weight` (the probability), `low`, `high` and `count`.
+
+        Args:
+            group: the name of a group; "all".
+
+        Raises:
+            ValueError: there is no such group.
+        """
+        import networkx as nx
+
+        if group not in (names := ["all", *self.group_names]):
+            raise ValueError(f"`group` must be one of {', '.join(names)}, got {group!r}.")
+        number = names.index(group)
+        counts = (self.counts if number == 0 else self.group_counts[number - 1]).double()
+        probs, low, high = _row_probs(counts), self.low[number], self.high[number]
+        apart = counts.clone().fill_diagonal_(0)
+        chance = apart.sum(0) / apart.sum().clamp(min=1)
+        graph = nx.DiGraph()
+        for name, count in zip(self.action_names, counts.sum(1).tolist(), strict=True):
+            graph.add_node(name, count=int(count))
+        for a, b in (low > chance).nonzero().tolist():
+            edge = {"weight": float(probs[a, b]), "low": float(low[a, b]), "high": float(high[a, b])}
+            graph.add_edge(self.action_names[a], self.action_names[b], **edge, count=int(counts[a, b]))
+        return graph
 
     def probs(self) -> Tensor:
         """`[A, A]`, float64: the probability of each action (column) after each (row); NaN in rows without counts."""
@@ -68,7 +136,13 @@ class Transitions:
         return _row_probs(self.group_counts)
 
 
-def transitions(plans: Plans, permutations: int = 999, generator: torch.Generator | None = None) -> Transitions:
+def transitions(
+    plans: Plans | Recordings,
+    permutations: int = 999,
+    generator: torch.Generator | None = None,
+    *,
+    by: str | None = None,
+) -> Transitions:
     """The transitions between successive actions within plans, and a test of whether the groups differ in them.
 
     The null distribution is that of the same statistics after the groups of the plans were permuted. Whole plans are
@@ -80,34 +154,54 @@ def transitions(plans: Plans, permutations: int = 999, generator: torch.Generato
     1993: single-step maxT).
 
     Args:
-        plans: with a `group`; without, nothing is tested. An end symbol is an action like others.
+        plans: with a `group`; without, nothing is tested. An end symbol is an action like others. Or recordings.
         permutations: at most so many; fewer where they take more than `MAX_WORK`, but at least `FEWEST_PERMUTATIONS`.
         generator: draws the permutations.
+        by: None: groups are the subjects. Else levels of this factor of the recordings, or "condition" of plans: then
+            whole subjects are permuted; nothing is tested where a subject is under several levels.
 
     Raises:
-        ValueError: `permutations` is below 1.
+        ValueError: `permutations` is below 1, or there is no such factor.
 
     Example:
         >>> transitions(Plans(torch.tensor([[0, 1, 0, 1, 1]]), 2)).counts.tolist()
         [[0, 2], [1, 1]]
     """
     check_sizes(permutations=permutations)
+    if isinstance(plans, Recordings):
+        plans = plans.plans(condition=by)
+    elif by not in (None, "condition"):
+        raise ValueError(f'`by` must be "condition" for plans, got {by!r}; recordings have factors by name.')
     flat, size = FlatPlans.of(plans), plans.num_actions
-    group = torch.zeros(len(plans), dtype=torch.long) if plans.group is None else plans.group.long()
+    subject = torch.arange(len(plans)) if plans.group is None else plans.group.long()
+    if by is None:
+        group, names, unit = plans.group, plans.group_names, torch.arange(len(plans))
+    else:
+        plans = RecordedPlans.of(plans)
+        group, names, unit = plans.condition, plans.condition_names, subject
+        if group is None:
+            raise ValueError("`by` must be left out for plans without a condition.")
+    group = torch.zeros(len(plans), dtype=torch.long) if group is None else group.long()
     groups, group = group.to(flat.actions.device).unique(return_inverse=True)
     at = flat.starts(2)
     cell, plan = flat.actions[at] * size + flat.actions[at + 1], flat.plan[at]
     group_counts = (group[plan] * size**2 + cell).bincount(minlength=len(groups) * size**2).view(-1, size, size)
     cells = torch.full((len(groups), size**2), float("nan"), dtype=torch.double, device=cell.device)
     made, p_value = 0, float("nan")
-    table = _Table.of(group_counts)
-    test = _which_test(table, group[plan.unique()].bincount())
+    table, units = _Table.of(group_counts), unit.to(cell.device)[plan]
+    under = torch.stack([units, group[plan]]).unique(dim=1)  # the groups that each unit is in
+    test: Test = "none" if len(under[0].unique()) < under.shape[1] else _which_test(table, under[1].bincount())
     if test == "permutation":
-        taken = _PlanCounts.of(plan, cell, group, table)
+        taken = _PlanCounts.of(units, cell, group[plan], table)
         made = min(permutations, max(MAX_WORK // _cost(table, taken), FEWEST_PERMUTATIONS))
         p_value, found = _permutation_test(table, taken, made, generator_on(generator, cell.device))
         cells[table.present[:, None], table.cell] = found
     statistic = float("nan") if test == "none" else float(table.overall(table.observed))
+    subjects = subject.to(cell.device)[plan]
+    whole = _interval(cell, subjects if len(subjects.unique()) > 1 else plan, size)
+    each = [_interval(cell[own], units[own], size) for own in (group[plan] == g for g in range(len(groups)))]
+    low, high = (torch.stack(ends) for ends in zip(whole, *each, strict=True))
+    numbered = "group" if by is None else "condition"
     return Transitions(
         group_counts.sum(0),
         group_counts,
@@ -117,7 +211,37 @@ def transitions(plans: Plans, permutations: int = 999, generator: torch.Generato
         cells.view(-1, size, size),
         test,
         made,
+        low,
+        high,
+        list(plans.action_names or map(str, range(size))),
+        [names[g] if names else f"{numbered} {g}" for g in groups.tolist()],
     )
+
+
+def _interval(cell: Tensor, unit: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """The 95 % interval `[A, A]` of each transition's probability, a ratio of sums over units (Cochran 1977, 6.3).
+
+    Args:
+        cell: int64 `[M]`: from * A + to of each transition.
+        unit: int64 `[M]`: the independent unit that it is of.
+        size: A.
+    """
+    rank = unit.unique(return_inverse=True)[1]
+    number = int(rank.max()) + 1 if len(rank) else 0
+    kinds, kind = cell.unique(return_inverse=True)  # only these have a probability other than 0
+    first, row = kinds.div(size, rounding_mode="floor").unique(return_inverse=True)
+    counts = (rank * len(kinds) + kind).bincount(minlength=number * len(kinds)).view(number, len(kinds)).double()
+    of_row = counts.new_zeros(number, len(first)).index_add_(1, row, counts)
+    total = of_row.sum(0)[row]
+    prob = counts.sum(0) / total
+    error = (counts - prob * of_row[:, row]).square().sum(0)
+    freedom = (of_row > 0).sum(0)[row].double() - 1
+    student = torch.from_numpy(np.asarray(stdtrit(freedom.clamp(min=1).cpu().numpy(), 0.975))).to(error.device)
+    half = student * (error * (freedom + 1) / freedom).sqrt() / total
+    half = half.masked_fill(freedom < 1, torch.nan)
+    low, high = (torch.full((size**2,), torch.nan, dtype=torch.double, device=cell.device) for _ in range(2))
+    low[kinds], high[kinds] = (prob - half).clamp(min=0), (prob + half).clamp(max=1)
+    return low.view(size, size), high.view(size, size)
 
 
 class _Table(NamedTuple):
@@ -171,7 +295,7 @@ class _Table(NamedTuple):
 
 
 class _PlanCounts(NamedTuple):
-    """The transitions of each of P plans that have any, as a sparse matrix, and the group of each plan."""
+    """The transitions of each of P units (plans, or subjects) that have any, as a sparse matrix, and their groups."""
 
     plan: Tensor  # int64 [Z]
     column: Tensor  # int64 [Z]: of a `_Table`
@@ -179,11 +303,11 @@ class _PlanCounts(NamedTuple):
     label: Tensor  # int64 [P]: the row of the plan's group in a `_Table`
 
     @staticmethod
-    def of(plan: Tensor, cell: Tensor, group: Tensor, table: _Table) -> "_PlanCounts":
+    def of(unit: Tensor, cell: Tensor, group: Tensor, table: _Table) -> "_PlanCounts":
         column = torch.searchsorted(table.cell, cell)
-        which, rank = plan.unique_consecutive(return_inverse=True)
+        which, rank = unit.unique(return_inverse=True)
         codes, times = (rank * len(table.cell) + column).unique(return_counts=True)
-        label = torch.searchsorted(table.present, group[which])
+        label = which.new_zeros(len(which)).scatter_(0, rank, torch.searchsorted(table.present, group))
         row = codes.div(len(table.cell), rounding_mode="floor")
         return _PlanCounts(row, codes % len(table.cell), times.double(), label)
 

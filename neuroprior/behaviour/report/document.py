@@ -3,12 +3,13 @@
 Needs pandas, matplotlib, jinja2 and rich (`neuroprior[report]`).
 """
 
+import json
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import pandas as pd
 import rich.table
@@ -18,9 +19,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.text import Text
 
-from neuroprior._files import read_json, versions, write_json, written_whole
+from neuroprior._files import read_json, versions, write_json, write_whole, written_whole
 from neuroprior.behaviour.report.findings import Sentence
-from neuroprior.behaviour.report.page import Section, Table, write_page
+from neuroprior.behaviour.report.page import Section, Table, clean, write_page
+
+if TYPE_CHECKING:
+    import networkx as nx
 
 Column = str | Callable[[Any], str]
 
@@ -48,6 +52,7 @@ class Document:
         keys: the name in `results.json` of a frame, where it is another.
         headline: the findings as sentences, in place of a lead.
         status: what is still to come, above all else; "" where it is whole.
+        graphs: by name; written as `NAME.graphml`, and as `NAME.gv` for Graphviz.
 
     Example:
         >>> Document(
@@ -66,6 +71,7 @@ class Document:
     keys: Mapping[str, str] = field(default_factory=dict)
     headline: Sequence[Sentence] = ()
     status: str = ""
+    graphs: Mapping[str, "nx.DiGraph"] = field(default_factory=dict)
 
     @property
     def said(self) -> list[str]:
@@ -163,6 +169,8 @@ def write_document(document: Document, folder: Path) -> None:
     write_frames(folder, dict.fromkeys(earlier, pd.DataFrame()))
     write_json(folder / RESULTS, results_of(document))  # before the tables: it says that they are its own
     write_frames(folder, document.frames)
+    for name, graph in document.graphs.items():
+        write_graph(folder / name, graph)
     shown = {**document.settings, **{f"version: {name}": number for name, number in versions().items()}}
     top = document.said
     write_page(folder / PAGE, document.title, top, document.sections, shown, document.command, document.status)
@@ -185,6 +193,21 @@ def write_frames(folder: Path, frames: Mapping[str, pd.DataFrame]) -> None:
             continue
         with written_whole(path) as file:
             frame.to_csv(file, index=False, lineterminator="\n")
+
+
+def write_graph(path: Path, graph: "nx.DiGraph") -> None:
+    """Write a graph as `path` with the endings `.graphml` and `.gv` (Graphviz)."""
+    import networkx as nx
+
+    with written_whole(path.with_suffix(".graphml"), "wb") as file:
+        nx.write_graphml(nx.relabel_nodes(graph, clean), file)
+    quoted = {name: json.dumps(clean(str(name)), ensure_ascii=False) for name in graph}
+    lines = [f"  {quoted[name]};" for name in graph]
+    for first, second, edge in graph.edges(data=True):
+        weight = edge["weight"]
+        how = f'label="{weight:.2f}", penwidth={0.5 + 5 * weight:.2f}, weight={weight:.4f}'
+        lines.append(f"  {quoted[first]} -> {quoted[second]} [{how}];")
+    write_whole(path.with_suffix(".gv"), "\n".join(["digraph {", *lines, "}", ""]).encode())
 
 
 def write_figures(folder: Path, figures: Mapping[str, Figure], kind: FigureKind = "png") -> None:

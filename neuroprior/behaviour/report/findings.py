@@ -57,21 +57,25 @@ class Sentence:
     finding: str | None = None
 
 
-def headline(verdicts: Sequence[Sentence], findings: Sequence[Finding]) -> list[Sentence]:
-    """The sentences at the top: what was found in all, then every starred finding, the surest first.
+def headline(verdicts: Sequence[str], sections: Sequence[Sequence[Finding]]) -> list[Sentence]:
+    """The sentences at the top: verdicts, then every starred finding in the order of the page.
 
-    Findings for which there is no room are named in the last sentence.
+    Where there is no room for all, the last findings of the sections with most are named in one sentence.
 
     Args:
         verdicts: answers of sections, such as which model is best.
-        findings: all; those that are starred are said.
+        sections: the findings of each section, the weightiest first; those that are starred are said.
     """
-    starred = sorted((one for one in findings if one.starred), key=lambda one: one.p_corrected)
-    room = max(MOST_SENTENCES - len(verdicts), 1)
-    shown, rest = (starred, []) if len(starred) <= room else (starred[: room - 1], starred[room - 1 :])
-    said = [*verdicts, *(Sentence(one.sentence, one.id) for one in shown)]
-    if rest:
-        said.append(Sentence(f"Starred, too: {'; '.join(one.feature for one in rest)}."))
+    starred = [[one for one in findings if one.starred] for findings in sections]
+    places = [(rank, number) for number, some in enumerate(starred) for rank in range(len(some))]
+    room = max(MOST_SENTENCES - len(verdicts), 2)
+    kept = sorted(places)[: room if len(places) <= room else room - 1]
+    said = [Sentence(verdict) for verdict in verdicts]
+    for rank, number in sorted(kept, key=lambda place: place[::-1]):
+        one = starred[number][rank]
+        said.append(Sentence(one.sentence, one.id))
+    if rest := sorted({*places} - {*kept}, key=lambda place: place[::-1]):
+        said.append(Sentence(f"Starred, too: {'; '.join(starred[number][rank].feature for rank, number in rest)}."))
     return said
 
 

@@ -5,6 +5,7 @@ import unicodedata
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -114,6 +115,11 @@ class FigureBox:
     caption: str
     alt: str
     name: str = ""
+
+    @cached_property
+    def drawing(self) -> str:
+        """The figure as `svg`, drawn once however often the page is written."""
+        return svg(self.figure)
 
 
 @dataclass(frozen=True)
@@ -233,7 +239,7 @@ def _following(tag: str) -> str:
 def _drawing(box: FigureBox, prefix: str) -> Markup:
     """The SVG of a figure under ids of its own: matplotlib numbers those of every figure alike."""
     labelled = Markup('<svg role="img" aria-label="{}" ').format(clean(box.alt))
-    text = _in_tags(lambda tag: re.sub(r'( id="|href="#|url\(#)', rf"\g<1>{prefix}", tag), svg(box.figure))
+    text = _in_tags(lambda tag: re.sub(r'( id="|href="#|url\(#)', rf"\g<1>{prefix}", tag), box.drawing)
     return Markup(text.replace("<svg ", labelled, 1))
 
 

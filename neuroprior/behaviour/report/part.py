@@ -1,7 +1,7 @@
 """A section of a report on plans with its tables, and what sections share: names, texts of p-values, limits."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import pandas as pd
 from torch import Tensor
@@ -10,6 +10,9 @@ from neuroprior.behaviour.report.findings import Finding
 from neuroprior.behaviour.report.page import Section
 from neuroprior.plans import Plans
 
+if TYPE_CHECKING:
+    import networkx as nx
+
 LISTED = 12
 """Rows that are shown of a table; its file has all."""
 
@@ -17,12 +20,13 @@ SIGNIFICANT = 0.05
 
 
 class Part(NamedTuple):
-    """A section, its tables of results by name, what it answers in a sentence each, and all that it tested."""
+    """A section, its tables of results by name, what it answers in a sentence each, all that it tested, and graphs."""
 
     section: Section
     frames: dict[str, pd.DataFrame]
     verdicts: Sequence[str] = ()
     findings: Sequence[Finding] = ()
+    graphs: Mapping[str, "nx.DiGraph"] = {}
 
 
 def action_names(plans: Plans) -> list[str]:
@@ -38,3 +42,8 @@ def group_names(plans: Plans, groups: Tensor) -> list[str]:
 def p_text(value: float) -> str:
     """A p-value in a table."""
     return f"{value:.1g}" if value else "<1e-300"
+
+
+def without_verdict(few: str) -> str:
+    """What a section says where there are too few independent units; "" where there are enough."""
+    return few and f"{few}: here are numbers and intervals, and no more is claimed."

@@ -17,7 +17,7 @@ from neuroprior.behaviour.reading.read import read_recordings
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.recordings import Recordings
 from neuroprior.behaviour.report.document import Document, FigureKind, check_place, write_document, write_figures
-from neuroprior.behaviour.report.findings import Sentence, headline
+from neuroprior.behaviour.report.findings import headline
 from neuroprior.behaviour.report.fits import (
     ACTIONS,
     CONTEXT,
@@ -35,6 +35,7 @@ from neuroprior.behaviour.report.part import Part
 from neuroprior.behaviour.report.scores import Evaluation, cross_validation, evaluate, evaluate_saved, jobs
 from neuroprior.behaviour.report.sections import OF_MODELS, SECTIONS, describe
 from neuroprior.plans import Plans
+from neuroprior.plans.columns import listed
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
 from neuroprior.plans.plans import AnyPlans
 from neuroprior.priors import Prior, load
@@ -226,22 +227,27 @@ def _cross_validate(
         Path(out).mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory() as temporary:
         run = cross_validation(Path(out or temporary), learned, other, design)
+        found, modes = evaluated([]), "" if fits.modes is None else "hidden modes"
+        at_once = [name for name in SECTIONS if name not in OF_MODELS[:2] and name != "modes"]
+        later = ["networks"] * bool(networks) + [modes] * bool(modes)
+        yield _Stage(found, at_once, _still("counts", *later))
         for _ in run.each(counts, processes=1, dask=fits.dask, title="counts"):
             pass
-        found, modes = evaluated(counts), "" if fits.modes is None else "hidden modes"
-        later = ["networks"] * bool(networks) + [modes] * bool(modes)
-        at_once = [name for name in SECTIONS if name != "modes"]
-        yield _Stage(found, at_once, f"Still running: {' and '.join(later)}." if later else "")
+        found = evaluated(counts)
+        yield _Stage(found, OF_MODELS, _still(*later))
         if networks:
             how: dict[str, Any] = {"processes": fits.processes, "dask": fits.dask, "title": "networks"}
             for seconds in run.each(networks, cost=lambda job: COSTS[job.kind], **how):
-                yield _Stage(
-                    found, (), f"Still running: {' and '.join(later)}; networks about {in_words(seconds)} more."
-                )
+                yield _Stage(found, (), _still(f"networks (about {in_words(seconds)} more)", *later[1:]))
             found = evaluated(todo)
-            yield _Stage(found, OF_MODELS, f"Still running: {modes}." if modes else "")
+            yield _Stage(found, OF_MODELS, _still(*later[1:]))
         if modes:
             yield _Stage(found, ("modes",), "")
+
+
+def _still(*later: str) -> str:
+    """What is still to come, as a sentence."""
+    return f"Still running: {listed(later)}." if later else ""
 
 
 def _inputs(fits: FitOptions, kinds: Sequence[str], learned: RecordedPlans, scored: RecordedPlans) -> list[str]:
@@ -291,13 +297,15 @@ def _document(
             "findings": [finding.row() for finding in findings],
         },
         keys=KEYS,
-        headline=headline([*map(Sentence, [*verdicts, *_scored(found)])], findings),
+        graphs={name: graph for part in parts for name, graph in part.graphs.items()},
+        headline=headline([*verdicts, *_scored(found)], [part.findings for part in parts]),
     )
 
 
 def _files(part: Part, figures: FigureKind | None) -> list[str]:
     """The files of a section's tables and figures."""
     tables = [f"{name}.csv" for name, frame in part.frames.items() if len(frame)]
+    tables += [f"{name}.{ending}" for name in part.graphs for ending in ("graphml", "gv")]
     return tables + [f"figures/{box.name}.{figures}" for box in part.section.figures if figures is not None]
 
 

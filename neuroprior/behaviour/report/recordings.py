@@ -2,13 +2,33 @@
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from neuroprior._statistics import mean_interval
-from neuroprior.behaviour.recordings import Recordings
+from neuroprior.behaviour.recordings import KEYS, Recordings
 from neuroprior.behaviour.report.document import Column, table
-from neuroprior.behaviour.report.page import Section
+from neuroprior.behaviour.report.drawing import (
+    SPARE,
+    WIDTH,
+    at_edges,
+    band,
+    drawn,
+    legend,
+    marker,
+    names_down,
+    panels,
+    short,
+)
+from neuroprior.behaviour.report.page import INK, FigureBox, Section
 from neuroprior.behaviour.report.part import LISTED, Part
 from neuroprior.behaviour.report.scores import Evaluation
+
+BINS = 10
+"""Parts of the longest recording in which behaviours are counted."""
+
+MOST_PANELS = 12
+"""Behaviours that are drawn over time: those that take the most."""
 
 
 def recording_section(found: Evaluation) -> Part | None:
@@ -42,20 +62,145 @@ def recording_section(found: Evaluation) -> Part | None:
         }
         caption = "Cohen's kappa over the time that both watched; models are fitted to the sequences of one observer."
         tables.append(table(agreement[:LISTED], columns, caption, "Agreement of observers"))
-    return Part(Section("Recordings", tables=tables), frames)
+    each, course = subject_budget(recordings), time_course(recordings)
+    frames |= {"subject_budget": each, "time_course": course}
+    caption = "Share of the watched time that each behaviour takes. Dots: subjects; bars: means with 95 % intervals."
+    boxes = [FigureBox(budget_figure(budget, each), caption, "Time budget with a dot for each subject.", "time_budget")]
+    if len(course):
+        caption = (
+            "Share of the watched time of each behaviour, by tenths of the longest recording; means over subjects,"
+        )
+        caption += " with 95 % intervals. What nobody watched does not count."
+        boxes.append(FigureBox(course_figure(course), caption, "Behaviours over time.", "time_course"))
+    return Part(Section("Time budget", tables=tables, figures=boxes), frames)
+
+
+def subject_budget(recordings: Recordings) -> pd.DataFrame:
+    """Return the share of the watched time of each behaviour and subject: `level, subject, behaviour, share`."""
+    kept = recordings.of_one_observer()
+    parts = []
+    for level, part in kept.by_level(_shown_factor(kept)):
+        shares = part.time_budget().rename_axis(index="subject", columns="behaviour")
+        parts.append(shares.reset_index().melt("subject", value_name="share").assign(level=level))
+    whole = pd.concat(parts, ignore_index=True).dropna()
+    return whole.reindex(columns=["level", "subject", "behaviour", "share"])
+
+
+def time_course(recordings: Recordings, bins: int = BINS) -> pd.DataFrame:
+    """Return how the time that behaviours take changes within recordings.
+
+    Args:
+        recordings: with known stops; times count from the first watched moment of each recording.
+        bins: equal parts of the longest recording.
+
+    Returns:
+        A frame with the columns `level` (of the only factor), `behaviour, time` (the middle of a part), `share` of the
+        watched time there, mean over subjects, its 95 % interval `low, high`, and `subjects`. Empty where no recording
+        takes any time.
+    """
+    kept = recordings.of_one_observer()
+    columns = ["level", "behaviour", "time", "share", "low", "high", "subjects"]
+    begin = kept.watched.groupby(KEYS)["start"].min().rename("begin")
+    events, watched = (frame.merge(begin, on=KEYS) for frame in (kept.events, kept.watched))
+    longest = float((watched["stop"] - watched["begin"]).max())
+    if not longest > 0:
+        return pd.DataFrame(columns=columns)
+    edges = np.linspace(0, longest, bins + 1)
+
+    def inside(frame: pd.DataFrame) -> NDArray[np.float64]:
+        """Return how much of each row lies in each part `[rows, bins]`."""
+        low, high = ((frame[end] - frame["begin"]).to_numpy()[:, None] for end in ("start", "stop"))
+        taken = np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1])
+        return np.asarray(np.nan_to_num(np.clip(taken, 0, None)))
+
+    factor = _shown_factor(kept)
+    events = events.assign(level=events[factor] if factor else "")
+    watched = watched.merge(events.groupby(KEYS)["level"].first().reset_index(), on=KEYS)
+    time = pd.DataFrame(inside(watched)).groupby([watched["level"], watched["subject"]]).sum()
+    done = pd.DataFrame(inside(events)).groupby([events["level"], events["subject"], events["behaviour"]]).sum()
+    rows = []
+    for level in time.index.get_level_values(0).unique():
+        own, whole = done.loc[level], time.loc[level].where(lambda values: values > 0)
+        for behaviour in own.index.get_level_values("behaviour").unique():
+            shares = own.xs(behaviour, level="behaviour").reindex(whole.index, fill_value=0.0) / whole
+            for place in range(bins):
+                values = shares[place].dropna().to_numpy()
+                if len(values):
+                    ends = mean_interval(values)[:3] if len(values) > 1 else (float(values[0]), np.nan, np.nan)
+                    middle = (edges[place] + edges[place + 1]) / 2
+                    rows.append((level, behaviour, middle, *ends, len(values)))
+    return pd.DataFrame(rows, columns=columns)
+
+
+def _shown_factor(recordings: Recordings) -> str | None:
+    """Return the factor that levels are of: the first; None without any."""
+    return recordings.factors[0] if recordings.factors else None
+
+
+@drawn
+def budget_figure(budget: pd.DataFrame, each: pd.DataFrame) -> Figure:
+    """The share of the watched time of each behaviour: a row a behaviour and level, a dot a subject, means with bars.
+
+    Args:
+        budget: `level, behaviour, share, low, high`, see `time_budget`.
+        each: `level, subject, behaviour, share`, see `subject_budget`.
+    """
+    levels = list(budget["level"].unique())
+    order = list(budget.groupby("behaviour")["share"].max().sort_values().index)
+    figure, (axes,) = panels(1, 1, (WIDTH, 0.8 + 0.2 * (1 + len(levels)) * len(order)))
+    hues = dict(zip(levels, (SPARE * len(levels))[: len(levels)], strict=True))
+    spread = np.linspace(0.28, -0.28, len(levels)) if len(levels) > 1 else np.zeros(1)
+    for place, behaviour in enumerate(order):
+        for shift, level in zip(spread, levels, strict=True):
+            of = (each["behaviour"] == behaviour) & (each["level"] == level)
+            dots = 100 * each.loc[of, "share"]
+            axes.plot(dots, np.full(len(dots), place + shift), "o", ms=4.5, mew=0, alpha=0.5, color=hues[level])
+            own = budget[(budget["behaviour"] == behaviour) & (budget["level"] == level)]
+            for row in own.itertuples():
+                axes.hlines(place + shift, 100 * row.low, 100 * row.high, color=hues[level], lw=2.2)
+                axes.plot(100 * row.share, place + shift, "|", ms=11, mew=2.4, color=INK)
+    names_down(axes, [short(str(name), 24) for name in order])
+    axes.set_xlim(left=0)
+    axes.set_xlabel("% of the watched time")
+    legend(figure, [marker(hues[level], False, short(str(level), 24)) for level in levels if level])
+    return figure
+
+
+@drawn
+def course_figure(course: pd.DataFrame) -> Figure:
+    """How the share of each behaviour changes over time: a panel a behaviour, a line with its band a level.
+
+    Args:
+        course: of `time_course`.
+    """
+    shown = list(course.groupby("behaviour")["share"].mean().sort_values(ascending=False).index)[:MOST_PANELS]
+    levels = list(course["level"].unique())
+    hues = dict(zip(levels, (SPARE * len(levels))[: len(levels)], strict=True))
+    across = min(len(shown), 3)
+    down = -(-len(shown) // across)
+    figure, cells = panels(down, across, (WIDTH, 1.7 * down + 0.6), sharex=True)
+    for axes, behaviour in zip(cells, shown, strict=False):
+        for level in levels:
+            own = course[(course["behaviour"] == behaviour) & (course["level"] == level)]
+            rows = own[["time", "share", "low", "high"]].mul([1, 100, 100, 100]).to_numpy()
+            band(axes, rows, hues[level], short(str(level), 20), "-")
+        axes.set_title(short(str(behaviour), 24), fontsize=9)
+        axes.set_ylim(bottom=0)
+    at_edges(cells, len(shown), across, "time", "% of the time")
+    legend(figure, [marker(hues[level], False, short(str(level), 24)) for level in levels if level])
+    return figure
 
 
 def time_budget(recordings: Recordings) -> pd.DataFrame:
-    """Return the share of the watched time that each behaviour takes, by the levels of the only factor.
+    """Return the share of the watched time that each behaviour takes, by the levels of the first factor.
 
     Returns:
-        A frame with the columns `level` ("" without one factor), `behaviour, share, low, high, subjects`: means over
+        A frame with the columns `level` ("" without a factor), `behaviour, share, low, high, subjects`: means over
         subjects, with Student's 95 % interval (NaN for a single subject); the longest behaviour of each level first.
     """
     kept = recordings.of_one_observer()
-    factor = kept.factors[0] if len(kept.factors) == 1 else None
     rows = []
-    for level, part in kept.by_level(factor):
+    for level, part in kept.by_level(_shown_factor(kept)):
         shares = part.time_budget()
         for behaviour in shares.mean().sort_values(ascending=False).index:
             values = shares[behaviour].dropna().to_numpy()

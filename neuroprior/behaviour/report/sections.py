@@ -13,18 +13,27 @@ from neuroprior.behaviour.analysis.comparison import never_occur, never_taken, t
 from neuroprior.behaviour.analysis.drift import action_drift, by_group, by_plan, by_position
 from neuroprior.behaviour.analysis.lags import mutual_information
 from neuroprior.behaviour.analysis.motifs import motifs
-from neuroprior.behaviour.analysis.transitions import transitions
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.report import figures
 from neuroprior.behaviour.report.conditions import condition_section
 from neuroprior.behaviour.report.document import Column, table
 from neuroprior.behaviour.report.durations import duration_section
 from neuroprior.behaviour.report.fits import ACTIONS
+from neuroprior.behaviour.report.individuals import individual_section
 from neuroprior.behaviour.report.modes import mode_section
 from neuroprior.behaviour.report.page import FigureBox, Section
-from neuroprior.behaviour.report.part import LISTED, SIGNIFICANT, Part, action_names, group_names, p_text
+from neuroprior.behaviour.report.part import (
+    LISTED,
+    SIGNIFICANT,
+    Part,
+    action_names,
+    group_names,
+    p_text,
+    without_verdict,
+)
 from neuroprior.behaviour.report.recordings import recording_section
 from neuroprior.behaviour.report.scores import Evaluation
+from neuroprior.behaviour.report.transitions import transition_section
 from neuroprior.plans import Plans, constant_context, has_patterns
 
 MOST_LAG = 20
@@ -131,7 +140,7 @@ def score_section(found: Evaluation) -> Part | None:
         " for the number of models.",
     ]
     text = text[:1] if saved else text
-    text.append(_no_verdict(found.too_few) or "A difference whose interval holds 0 is not significant.")
+    text.append(without_verdict(found.too_few) or "A difference whose interval holds 0 is not significant.")
     caption_of_figure = f"Bits per {'' if saved else 'held-out '}action, 95 % intervals over {found.unit}."
     best = found.best
     alt = f"Bits per action of each model, the fewest {best.cost:.3f} of {best.label}."
@@ -171,7 +180,7 @@ def lag_section(found: Evaluation) -> Part | None:
         "Where the gain of the chain ends before that of the GRU, longer histories matter but occur too seldom to be"
         " counted; below 0, splitting the counts loses more than the older action adds.",
     ]
-    text += [_no_verdict(few)] if few else []
+    text += [without_verdict(few)] if few else []
     caption = (
         "Bits that the action k steps back adds. Dashed: the 95 % quantile of the mutual information of independent"
         " actions."
@@ -179,50 +188,6 @@ def lag_section(found: Evaluation) -> Part | None:
     box = FigureBox(figures.lag_figure(lags), caption, "Information by lag.", "lags")
     shown = table(wide, columns, "Bits." if few else f"Bits. *: above 0, by the 95 % interval of that lag over {over}.")
     return Part(Section("Information by lag", text, [shown], [box]), {"lags": lags})
-
-
-def transition_section(found: Evaluation) -> Part | None:
-    """Transition probabilities, overall and in each group."""
-    plans = found.plans
-    if int(plans.mask().sum(1).max()) < 2:
-        return None
-    result = transitions(plans, generator=_shuffles())
-    names = action_names(plans)
-    groups = group_names(plans, result.groups) if plans.group is not None else []
-    probs, each = result.probs(), result.group_probs()
-    of_groups = zip(groups, result.group_counts, each, result.cell_p_values, strict=False)
-    rows = [
-        {
-            "group": group,
-            "from": names[a],
-            "to": names[b],
-            "count": int(counts[a, b]),
-            "probability": float(matrix[a, b]),
-            "p_value": None if p_values is None else float(p_values[a, b]),
-        }
-        for group, counts, matrix, p_values in [("all", result.counts, probs, None), *of_groups]
-        for a, b in counts.nonzero().tolist()
-    ]
-    frames = {"transitions": pd.DataFrame(rows), "transition_test": pd.DataFrame()}
-    text, tables = ["The probability of each action after each other one, within plans."], []
-    caption = "The probability of each action (column) after each action (row)."
-    boxes = [FigureBox(figures.transition_figure(probs, names), caption, "Transition matrix.", "transitions")]
-    if len(groups) > 1:
-        row = {"groups": len(groups), "test": result.test, "permutations": result.permutations}
-        test = pd.DataFrame([row | {"statistic": result.statistic, "p_value": result.p_value}])
-        few = too_few(plans)
-        tested_by = "That groups have the same transitions is tested by permuting plans between them, where they have"
-        text.append(_no_verdict(few) or f"{tested_by} enough. Marked cells differ at p < 0.05, corrected for all.")
-        columns = {"groups": "groups", "permutations": "permutations:,", "p": "p_value:.2g"}
-        if not few:
-            caption = "Whether groups have the same transitions (p: blank if not tested)."
-            tables.append(table(test, columns, caption, align="rrr"))
-        significant = (result.cell_p_values < SIGNIFICANT) & (not few)
-        figure = figures.group_transition_figure(each, probs, names, groups, significant)
-        caption = "Each group's transition probabilities less those of all."
-        boxes.append(FigureBox(figure, caption, "Differences of the groups' transitions.", "group_transitions"))
-        frames["transition_test"] = test
-    return Part(Section("Transitions", text, tables, boxes), frames)
 
 
 def motif_section(found: Evaluation) -> Part | None:
@@ -249,7 +214,7 @@ def motif_section(found: Evaluation) -> Part | None:
         " to be of one chain: where groups differ, sequences of some of them are over-represented, too. One such"
         " sequence makes others over-represented that share its beginning.",
         *([] if len(frame) else ["There are none (p < 0.05, corrected for all sequences)."]),
-        *([_no_verdict(few)] if few else []),
+        *([without_verdict(few)] if few else []),
     ]
     tables, boxes = [], []
     if len(frame):
@@ -293,7 +258,7 @@ def drift_section(found: Evaluation) -> Part | None:
             " more, which alone is a change over a plan."
         ),
         *(["The only plan was cut into consecutive parts, which stand for plans."] * bool(found.settings.get("cut"))),
-        *([_no_verdict(found.too_few)] if found.too_few else []),
+        *([without_verdict(found.too_few)] if found.too_few else []),
     ]
     columns: Mapping[str, Column] = {
         "test": "test",
@@ -353,21 +318,17 @@ SECTIONS: dict[str, Callable[[Evaluation], Part | None]] = {
     "conditions": condition_section,
     "lags": lag_section,
     "transitions": transition_section,
-    "motifs": motif_section,
     "durations": duration_section,
-    "modes": mode_section,
+    "individuals": individual_section,
     "drift": drift_section,
+    "motifs": motif_section,
+    "modes": mode_section,
 }
 """By name, in the order of the page."""
 
 
 OF_MODELS = ("scores", "lags", "durations", "drift")
 """Sections that say more when networks were fitted."""
-
-
-def _no_verdict(few: str) -> str:
-    """What a section says where there are too few independent units; "" where there are enough."""
-    return few and f"{few}: here are numbers and intervals, and no more is claimed."
 
 
 def _without_p(columns: Mapping[str, Column], few: str) -> Mapping[str, Column]:

@@ -1,0 +1,209 @@
+"""The section on individuals: how each differs from the others, where it stands, and whether there are types."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+import torch
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+from scipy.cluster.hierarchy import dendrogram, linkage
+from scipy.spatial.distance import squareform
+
+from neuroprior._statistics import ENOUGH_UNITS
+from neuroprior.behaviour.analysis.comparison import too_few
+from neuroprior.behaviour.analysis.individuals import (
+    FEWEST_INDIVIDUALS,
+    Individuals,
+    individual_types,
+    individuals,
+)
+from neuroprior.behaviour.analysis.transitions import transitions
+from neuroprior.behaviour.recorded_plans import RecordedPlans
+from neuroprior.behaviour.report.document import Column, table
+from neuroprior.behaviour.report.drawing import (
+    SPARE,
+    STRIPS,
+    WIDTH,
+    Array,
+    drawn,
+    legend,
+    marker,
+    names_down,
+    panels,
+    short,
+)
+from neuroprior.behaviour.report.findings import LEVEL, Finding, p_words
+from neuroprior.behaviour.report.page import INK, FigureBox, Section
+from neuroprior.behaviour.report.part import Part, action_names, group_names, without_verdict
+from neuroprior.behaviour.report.scores import Evaluation
+
+OTHER = "#7d838c"
+
+
+def individual_section(found: Evaluation) -> Part | None:
+    """A row and a strip for each individual; None where there are fewer than two."""
+    plans, generator = found.plans, torch.Generator().manual_seed(0)
+    some = plans[plans.mask().sum(1) > 1].group
+    if some is None or len(some.unique()) < 2:
+        return None
+    result = individuals(plans, generator)
+    frame, budget = result.frame(), individual_budget(plans)
+    enough = len(result.names) >= ENOUGH_UNITS
+    columns: dict[str, Column] = {
+        "individual": "individual",
+        "from the others": "distance:.3f",
+        "95 % interval": lambda row: f"{row.low:.3f} to {row.high:.3f}",
+        "by chance": "by_chance:.3f",
+        "differs most in": "differs_in",
+    }
+    caption = (
+        "From the others: the Jensen-Shannon distance of its transition probabilities from those of all others."
+        " By chance: 95 % stay below where all are alike (chains of order 1, with as many transitions)."
+    )
+    tables = [table(frame, columns, caption, "Individuals", "lrrrl")]
+    frames = {"individuals": frame, "individual_budget": budget.reset_index()}
+    text = []
+    if len(result.names) >= FEWEST_INDIVIDUALS:
+        types = individual_types(plans, generator)
+        frames["individual_types"] = types.frame()
+        text.append(types.sentence)
+    condition = _conditions(plans, result)
+    boxes = [
+        FigureBox(
+            budget_strips(budget, result),
+            "What each individual did, as shares of its actions, and how far it is from the others (95 % interval;"
+            " grey: what is usual by chance).",
+            "Strips of behaviours of each individual.",
+            "individual_strips",
+        ),
+        FigureBox(
+            plane_figure(result.places, result.names, condition),
+            "Individuals in a plane: the nearer two are, the more alike are their transitions (classical scaling).",
+            "Individuals as points in a plane.",
+            "individual_plane",
+        ),
+    ]
+    if len(result.action_names) > 2:
+        boxes.append(
+            FigureBox(
+                dendrogram_figure(result.probs.mean(0), result.action_names),
+                "Behaviours that are followed by the same ones stand together (average linkage of Jensen-Shannon"
+                " distances).",
+                "Tree of behaviours.",
+                "behaviour_tree",
+            )
+        )
+    most = frame.iloc[int(frame["distance"].argmax())]
+    tested = transitions(plans, generator=generator)
+    p_value = tested.p_value
+    sentence = (
+        f"Individuals differ in their transitions ({p_words(p_value)}), most of all {most.individual}: its distance"
+        f" from the others is {most.distance:.3f}, 95 % interval {most.low:.3f} to {most.high:.3f} ({most.differs_in})."
+    )
+    estimate = (float(most.distance), float(most.low), float(most.high))
+    starred = bool(enough and p_value < LEVEL)
+    findings = [Finding("individuals", "individuals", "individuals", *estimate, p_value, p_value, starred, sentence)]
+    if tested.test == "none":
+        findings = []
+    elif not starred:
+        text.append(without_verdict(too_few(plans)) or f"That they differ was not found ({p_words(p_value)}).")
+    return Part(Section("Individuals", text, tables, boxes), frames, findings=findings)
+
+
+def individual_budget(plans: RecordedPlans) -> pd.DataFrame:
+    """The share of each behaviour among the actions of each individual: a row an individual, a column a behaviour."""
+    mask, size = plans.mask(), plans.num_actions
+    assert plans.group is not None
+    own = plans.group.long()[:, None].expand(mask.shape)[mask]
+    present, rank = own.unique(return_inverse=True)
+    counts = (rank * size + plans.actions[mask].long()).bincount(minlength=len(present) * size).view(-1, size)
+    shares = (counts / counts.sum(1, keepdim=True)).cpu().numpy()
+    return pd.DataFrame(shares, index=group_names(plans, present), columns=action_names(plans))
+
+
+def _conditions(plans: RecordedPlans, result: Individuals) -> list[str]:
+    """The condition of each individual; "" where it is under several, or there are none."""
+    if plans.condition is None or plans.group is None:
+        return [""] * len(result.names)
+    pairs = torch.stack([plans.group.long(), plans.condition.long()]).unique(dim=1)
+    names = plans.condition_names or [f"condition {c}" for c in range(int(pairs[1].max()) + 1)]
+    under: dict[str, list[str]] = {}
+    for name, condition in zip(group_names(plans, pairs[0]), pairs[1].tolist(), strict=True):
+        under.setdefault(name, []).append(names[condition])
+    return [under[name][0] if len(under[name]) == 1 else "" for name in result.names]
+
+
+@drawn
+def budget_strips(budget: pd.DataFrame, result: Individuals) -> Figure:
+    """A strip for each individual, all of them: its shares of behaviours, and its distance from the others.
+
+    Args:
+        budget: shares; a row an individual, a column a behaviour.
+        result: of `individuals`.
+    """
+    rows = budget.reindex([*result.names])
+    order = rows.mean().sort_values(ascending=False).index
+    figure, (left, right) = panels(1, 2, (WIDTH, 0.9 + 0.24 * len(rows)), sharey=True, width_ratios=(3, 1))
+    at, edge = np.arange(len(rows))[::-1], np.zeros(len(rows))
+    colors = [*STRIPS[:11], *[OTHER] * len(order)]
+    for color, behaviour in zip(colors, order, strict=False):
+        left.barh(at, rows[behaviour], left=edge, height=0.8, color=color, lw=0)
+        edge = edge + rows[behaviour].to_numpy()
+    left.set(xlim=(0, 1), xlabel="share of actions")
+    names_down(left, [short(str(name), 16) for name in rows.index], at)
+    right.barh(at, result.by_chance, height=0.8, color=OTHER, alpha=0.25, lw=0)
+    distance, low, high = result.from_others.T
+    right.hlines(at, low, high, color=INK, lw=1.6)
+    right.plot(distance, at, "o", color=INK, ms=4.5)
+    right.set(xlim=(0, None), xlabel="distance from the others")
+    right.tick_params(axis="y", length=0)
+    shown = [marker(color, False, short(str(name), 18), "s") for color, name in zip(STRIPS[:11], order, strict=False)]
+    legend(figure, shown + [marker(OTHER, False, "others", "s")] * (len(order) > 11))
+    return figure
+
+
+@drawn
+def plane_figure(places: ArrayLike, names: Sequence[str], condition: Sequence[str]) -> Figure:
+    """Individuals as points in a plane, coloured by their condition.
+
+    Args:
+        places: `[S, 2]`.
+        names: S of them.
+        condition: of each; "" for none.
+    """
+    points = np.asarray(places, dtype=np.float64)
+    figure, (axes,) = panels(1, 1, (WIDTH * 0.75, WIDTH * 0.6))
+    kinds = sorted(set(condition))
+    hues = dict(zip(kinds, (SPARE * len(kinds))[: len(kinds)], strict=True))
+    for (x, y), name, kind in zip(points, names, condition, strict=True):
+        axes.plot(x, y, "o", ms=7, color=hues[kind], mew=0, alpha=0.8)
+        axes.annotate(short(name, 14), (x, y), xytext=(5, 4), textcoords="offset points", fontsize=8)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set(xlabel="first dimension", ylabel="second dimension")
+    axes.margins(0.15)
+    legend(figure, [marker(hues[kind], False, short(kind, 24)) for kind in kinds if kind])
+    return figure
+
+
+@drawn
+def dendrogram_figure(probs: Array, names: Sequence[str]) -> Figure:
+    """A tree of behaviours, by how alike the probabilities of the next one are.
+
+    Args:
+        probs: `[A, A]`: transition probabilities.
+        names: A of them.
+    """
+    middle = (probs[:, None] + probs[None]) / 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        parts = np.nan_to_num(probs[:, None] * np.log2(probs[:, None] / middle)).sum(-1)
+    distances = np.sqrt(np.clip((parts + parts.T) / 2, 0, None))
+    np.fill_diagonal(distances, 0)
+    figure, (axes,) = panels(1, 1, (WIDTH * 0.75, 0.8 + 0.26 * len(names)))
+    tree = linkage(squareform(distances, checks=False), "average")
+    labels = [short(name, 24) for name in names]
+    dendrogram(tree, orientation="left", labels=labels, ax=axes, color_threshold=0, above_threshold_color=SPARE[4])
+    axes.tick_params(axis="y", labelsize=10)
+    axes.spines["left"].set_visible(False)
+    axes.set_xlabel("distance")
+    return figure
