@@ -43,6 +43,7 @@ if TYPE_CHECKING:
         by_plan,
         by_position,
     )
+    from neuroprior.behaviour.analysis.individuals import Individuals, Types, individual_types, individuals
     from neuroprior.behaviour.analysis.lags import LagInformation, mutual_information
     from neuroprior.behaviour.analysis.modes import ModeChoice, choose_modes, mode_frame, mode_plans, mode_table
     from neuroprior.behaviour.analysis.motifs import Motif, motifs
@@ -68,6 +69,7 @@ __all__ = [
     "DurationLaw",
     "DurationModel",
     "GroupDrift",
+    "Individuals",
     "Interval",
     "LAW_NAMES",
     "LagInformation",
@@ -85,6 +87,7 @@ __all__ = [
     "Score",
     "SemiMarkovPrior",
     "Transitions",
+    "Types",
     "action_bits",
     "action_drift",
     "baselines",
@@ -94,6 +97,8 @@ __all__ = [
     "choose_modes",
     "compare_conditions",
     "holm",
+    "individual_types",
+    "individuals",
     "mean_interval",
     "mode_frame",
     "mode_plans",
@@ -119,6 +124,7 @@ _ROOMS = (
     "neuroprior.behaviour.analysis.comparison",
     "neuroprior.behaviour.analysis.conditions",
     "neuroprior.behaviour.analysis.drift",
+    "neuroprior.behaviour.analysis.individuals",
     "neuroprior.behaviour.analysis.lags",
     "neuroprior.behaviour.analysis.modes",
     "neuroprior.behaviour.analysis.motifs",

@@ -9,15 +9,17 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
 
+import pandas as pd
 import torch
 from jsonargparse import ActionConfigFile, ArgumentError  # type: ignore[attr-defined]
-from jsonargparse.typing import PositiveInt
+from jsonargparse.typing import NonNegativeInt, PositiveInt
 from rich.console import Console
 
 from neuroprior._files import write_whole
+from neuroprior.behaviour.analysis.comparison import best_chain
 from neuroprior.behaviour.analysis.modes import choose_modes
 from neuroprior.behaviour.recorded_plans import RecordedPlans
-from neuroprior.behaviour.report.document import printed, write_frames
+from neuroprior.behaviour.report.document import Column, printed, table, write_frames
 from neuroprior.behaviour.report.modes import choice_table
 from neuroprior.behaviour.report.options import ReadOptions
 from neuroprior.cli.fit_data import Parts, divide
@@ -27,9 +29,10 @@ from neuroprior.cli.reading import add_reading_arguments, pop_reading
 from neuroprior.planners import Planner, collect
 from neuroprior.plans import write_plans
 from neuroprior.plans.io.npz import read_npz
-from neuroprior.priors import CombinedPrior, Prior, SwitchingPrior, load
+from neuroprior.priors import CombinedPrior, MarkovPrior, Prior, SwitchingPrior, load
 from neuroprior.priors.ensembles.candidates import Effort
 from neuroprior.priors.fitting import make_prior
+from neuroprior.priors.learning import plans_for
 from neuroprior.priors.neural import NeuralPrior
 from neuroprior.training import Settings, train
 from neuroprior.worlds import World
@@ -95,6 +98,7 @@ def fit(
     prior: Callable[[int], Prior] = CombinedPrior,
     effort: Effort | None = None,
     modes: list[PositiveInt] | None = None,
+    orders: list[NonNegativeInt] | None = None,
     use_context: bool = True,
     world: World | None = None,
     planner: Planner | None = None,
@@ -122,6 +126,8 @@ def fit(
         effort: how much the combined prior spends on networks.
         modes: numbers of hidden modes of a SwitchingPrior to choose from: the fewest that predict held-out plans as
             well as the best.
+        orders: of a MarkovPrior to choose from, with its back-off and smoothing: those that predict held-out plans
+            best. An order that the prior is given (`--prior.order 2`, other than 1) is the only one.
         use_context: whether the prior takes the context of the plans, where they have one.
         world: where plans are collected if no file is given, such as `neuroprior.worlds.gridworld`.
         planner: that chooses them, such as `ExhaustivePlanner`.
@@ -134,7 +140,7 @@ def fit(
         held_out: share of plans (or groups) for the table at the end; nothing is learned or chosen on them.
         folds: of a cross-validation over groups (over plans without groups), in place of a held-out share: the prior
             and the baselines are fitted once more for each fold, for the table alone, and the prior that is saved
-            learns from all plans. By default 5 with fewer than 15 groups, 2 with two plans, else 1, which holds out a
+            learns from all plans. By default 5 with fewer than 50 groups, 2 with two plans, else 1, which holds out a
             share.
         training: settings of networks.
         seed: draws the collected plans, the parts and the order of training.
@@ -167,6 +173,8 @@ def fit(
     frames = {}
     if modes is not None:
         made, frames["modes"] = _choose_modes(made, modes, parts)
+    if orders is not None:
+        made, frames["orders"] = _choose_order(made, orders, parts)
     if made.fit_settings and torch.cuda.is_available():
         made.cuda()
     fresh = deepcopy(made)
@@ -217,6 +225,28 @@ def _choose_modes(prior: Prior, modes: list[int], parts: Parts) -> tuple[Prior, 
     )
     Console().print(printed("Hidden modes", choice_table(choice)))
     return SwitchingPrior(**prior.config | {"num_modes": choice.chosen}), choice.frame()
+
+
+def _choose_order(prior: Prior, orders: list[int], parts: Parts) -> tuple[Prior, pd.DataFrame]:
+    """Choose order, back-off and smoothing on plans that are not learned from; return what was tried, too."""
+    if not isinstance(prior, MarkovPrior):
+        raise ValueError(f"`prior` must be a MarkovPrior (--config markov) for orders, got {type(prior).__name__}.")
+    if prior.order != 1:
+        orders = [prior.order]
+    contexts = [prior.num_contexts]
+    plans = [plans_for(prior, part) for part in (parts.learned_from, parts.chosen_on)]
+    tried = [best_chain(plans[0], order, contexts, plans[1]) for order in sorted(set(orders))]
+    best = min(tried, key=lambda one: one.validation_bits)
+    if not isinstance(best.prior, MarkovPrior):
+        raise ValueError(f"`orders` must leave a chain that fits into memory, got {orders}.")
+    rows = [(one.model, one.how, one.validation_bits, one is best) for one in tried]
+    frame = pd.DataFrame(rows, columns=["chain", "how", "bits", "chosen"])
+    columns: dict[str, Column] = {"chain": "chain", "back-off, smoothing": "how", "bits per action": "bits:.4f"}
+    columns[""] = lambda row: "chosen" if row.chosen else ""
+    shown = table(frame, columns, "On plans that the chains did not learn from.", align="llrl")
+    Console().print(printed("Order of the chain", shown))
+    chosen = {name: best.prior.config[name] for name in ("order", "smoothing", "backoff")}
+    return MarkovPrior(**prior.config | chosen), frame
 
 
 def _saved(folder: Path) -> Prior | None:

@@ -12,8 +12,8 @@ from neuroprior.priors.construction import context_arguments
 MIN_PARTS, MIN_ACTIONS = 3, 2
 """Parts that plans are split into, and the fewest actions of each."""
 
-FEW_GROUPS, FOLDS = 15, 5
-"""Groups below which the comparison is a cross-validation, as a tenth of them would be one; and its folds."""
+FEW_GROUPS, FOLDS = 50, 5
+"""Groups below which the comparison is a cross-validation, as a tenth of them would be few; and its folds."""
 
 MIN_ACTIONS_OF_TWO = 100
 """Two plans or groups are enough if each has so many actions; validation then takes some of the plans, or the end of

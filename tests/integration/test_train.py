@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import pytest
 import torch
 
@@ -17,6 +18,7 @@ from neuroprior.plans import read_plans, write_minari, write_plans
 from neuroprior.priors import StackedPrior
 from neuroprior.priors.scoring import learned_from
 from neuroprior.training import Settings
+from tests.support.chains import markov_plans, markov_probs
 from tests.support.events import write_events
 from tests.support.sources import seeded
 
@@ -157,6 +159,19 @@ def test_each_kind_of_file(name, tmp_path, monkeypatch):
     assert ("context" in report["rows"][-1]["context"]) == (plans.context is not None)
     assert load(tmp_path / "run").takes_context == (plans.context is not None)
     assert read_plans(tmp_path / "run" / "plans.npz").actions.shape == plans.actions.shape
+
+
+def test_the_order_of_a_chain_is_chosen_on_held_out_plans(tmp_path):
+    """Of a source of order 2; an order that is given is the only one that is tried."""
+    plans = markov_plans(markov_probs(3, 2, 0, 3), 300, 12, 1)
+    write_plans(plans, tmp_path / "plans.npz")
+    for more, order, tried in ([], 2, 7), (["--prior.order", "3"], 3, 1):
+        out = tmp_path / f"run{order}"
+        assert main(["fit", str(tmp_path / "plans.npz"), "--config", "markov", *more, "--out", str(out)]) == 0
+        assert load(out).order == order
+        table = pd.read_csv(out / "orders.csv")
+        assert len(table) == tried
+        assert table.loc[table["bits"].idxmin(), "chosen"]
 
 
 def test_an_end_symbol(tmp_path, plans_file):

@@ -242,11 +242,16 @@ def baselines(
     for order in ORDERS:
         if progress is not None:
             progress(f"markov-{order}")
-        yield _best(f"markov-{order}", _chains(training, order, contexts, validation), validation)
+        yield best_chain(training, order, contexts, validation)
     if progress is not None:
         progress("context tree")
     trees = (ContextTreePrior(training.num_actions, DEPTH, num_contexts=num) for num in contexts)
     yield _best("context tree", ((f"depth {DEPTH}", tree.fit(plans_for(tree, training))) for tree in trees), validation)
+
+
+def best_chain(training: Plans, order: int, contexts: list[int | None], validation: Plans) -> Baseline:
+    """The Markov chain of an order whose context (one of these), back-off and smoothing predict `validation` best."""
+    return _best(f"markov-{order}", _chains(training, order, contexts, validation), validation)
 
 
 def _chains(training: Plans, order: int, contexts: list[int | None], validation: Plans) -> Iterator[tuple[str, Prior]]:

@@ -8,7 +8,8 @@ import torch
 from scipy import stats
 
 from neuroprior import Plans
-from neuroprior.behaviour import transitions
+from neuroprior._statistics import ratio_difference
+from neuroprior.behaviour import RecordedPlans, transitions
 from neuroprior.behaviour.analysis.transitions import FEWEST_PERMUTATIONS
 from tests.support.chains import markov_plans, markov_probs
 from tests.support.sources import FALSE_ALARM, refuses, seeded
@@ -195,3 +196,56 @@ def test_work_is_bounded(monkeypatch):
 def test_bad_input():
     with refuses("permutations", "0"):
         transitions(unequal(), 0)
+
+
+def by_condition() -> RecordedPlans:
+    """Five animals under two conditions, of two to four sessions of different lengths."""
+    group = torch.tensor([0, 0, 1, 1, 1, 2, 2, 3, 3, 3, 3, 4, 4])
+    condition = torch.tensor([0, 0, 1, 1, 1, 0, 0, 1, 1, 1, 1, 0, 0])
+    actions = torch.randint(3, (13, 30), generator=seeded(4))
+    names = {"action_names": ("eat", "rest", "walk"), "condition_names": ("saline", "drug")}
+    lengths = 12 + torch.arange(13)
+    return RecordedPlans(actions, 3, lengths, group=group, condition=condition, **names)
+
+
+def test_intervals_are_those_of_ratios_over_subjects():
+    plans = by_condition()
+    found = transitions(plans, 9, seeded(0), by="condition")
+    frame = found.frame()
+    assert [*frame["group"].unique()] == ["all", "saline", "drug"]
+    for row in frame.itertuples():
+        own = plans if row.group == "all" else plans[plans.condition == ["saline", "drug"].index(row.group)]
+        per = transitions(own, 1, seeded(0)).group_counts.double()
+        a, b = (plans.action_names.index(name) for name in (row[2], row.to))
+        mean, low, high, _ = ratio_difference(per[:, a, b], per[:, a].sum(1))
+        assert (row.probability, row.low, row.high) == pytest.approx((mean, max(low, 0), min(high, 1)))
+        assert row.count == per[:, a, b].sum()
+
+
+def test_whole_subjects_are_permuted_between_conditions():
+    """Three animals against two: ten divisions are too few; of six against six there are enough. Within: none."""
+    assert transitions(by_condition(), 9, seeded(0), by="condition").test == "none"
+    plans = markov_plans(markov_probs(3, 1, 0), 24, 20, 1)
+    group = torch.arange(24) // 2
+    between = RecordedPlans(plans.actions, 3, group=group, condition=group % 2)
+    assert transitions(between, 9, seeded(0), by="condition").test == "permutation"
+    within = RecordedPlans(plans.actions, 3, group=group, condition=torch.arange(24) % 2)
+    assert transitions(within, 9, seeded(0), by="condition").test == "none"
+    with refuses("`by` must be"):
+        transitions(between, by="treatment")
+
+
+def test_the_graph_has_the_transitions_above_chance():
+    probs = torch.tensor([[0.0, 0.8, 0.2], [0.45, 0.1, 0.45], [0.1, 0.6, 0.3]])
+    plans = markov_plans(probs[None].log().softmax(-1)[0], 12, 200, 3, group=torch.arange(12) % 6)
+    found = transitions(plans, 9, seeded(0))
+    graph, counts = found.graph(), found.counts.double()
+    apart = counts.clone().fill_diagonal_(0)
+    above = {
+        (str(a), str(b)) for a in range(3) for b in range(3) if found.low[0, a, b] > apart[:, b].sum() / apart.sum()
+    }
+    assert {*graph.edges} == above
+    assert ("0", "1") in above
+    assert graph.edges["0", "1"]["weight"] == pytest.approx(float(found.probs()[0, 1]))
+    with refuses("`group` must be one of all, "):
+        found.graph("nobody")
