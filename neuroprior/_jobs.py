@@ -11,6 +11,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import lru_cache, partial
 from math import isnan, nan
 from pathlib import Path
@@ -24,6 +25,9 @@ Result = TypeVar("Result")
 
 QUIET_SECONDS = 9
 """After which progress says something, though no job was finished."""
+
+SILENT_SECONDS = 1.5
+"""After which a program says what it does."""
 
 SCHEDULER_SECONDS = 10
 """In which a Dask scheduler has to answer."""
@@ -356,6 +360,18 @@ class Progress:
         while not self._ended.wait(1):
             if time.monotonic() - self._said >= QUIET_SECONDS:
                 self._say("finished")
+
+
+@contextmanager
+def saying(what: str) -> Iterator[None]:
+    """Say what is done, on standard error, where it takes longer than `SILENT_SECONDS`."""
+    timer = threading.Timer(SILENT_SECONDS, partial(print, what, file=sys.stderr, flush=True))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def in_words(seconds: float) -> str:

@@ -12,6 +12,7 @@ from types import NoneType, UnionType
 from typing import Any, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 from neuroprior._interrupts import ending_at_interrupts
+from neuroprior._jobs import saying
 from neuroprior._version import __version__
 from neuroprior.behaviour.reading import Options
 from neuroprior.cli.reading import add_reading_arguments, pop_reading
@@ -27,13 +28,11 @@ class Command(NamedTuple):
         target: `module:function`, imported only when the command is given.
         about: one line for the list of commands.
         raw: the function parses its arguments itself: it is called with the list of them.
-        slow: importing it takes seconds, so that something is said first, on standard error.
     """
 
     target: str
     about: str
     raw: bool = False
-    slow: bool = False
 
     def load(self) -> Callable[..., Any]:
         """Import the function."""
@@ -72,12 +71,12 @@ def run_commands(
         if name not in commands:
             raise ValueError(f"{name!r} is no command; there are {', '.join(commands)}")
         command = commands[name]
-        if command.slow and not {"-h", "--help"} & {*options}:
-            print(f"{program} {name}: starting", file=sys.stderr, flush=True)
+        with saying(f"{program} {name}: starting"):
+            function = command.load()
         if command.raw:
-            command.load()(options)
+            function(options)
         else:
-            call(command.load(), f"{program} {name}", options)
+            call(function, f"{program} {name}", options)
 
     return run_program(run, arguments)
 

@@ -83,7 +83,7 @@ def test_the_sizes_of_parts(plans, shares, due):
 
 @pytest.mark.parametrize(
     ("groups", "wanted", "folds"),
-    [(3, None, 3), (14, None, 5), (15, None, 1), (None, None, 1), (6, 6, 6), (6, 1, 1), (None, 60, 60)],
+    [(3, None, 3), (49, None, 5), (50, None, 1), (None, None, 1), (6, 6, 6), (6, 1, 1), (None, 60, 60)],
 )
 def test_the_number_of_folds(groups, wanted, folds):
     group = None if groups is None else torch.arange(60) % groups

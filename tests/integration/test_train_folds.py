@@ -43,7 +43,9 @@ def bits_of_folds(plans: Plans, number: int, fit) -> float:
 
 def test_each_group_is_held_out_once(tmp_path, capsys):
     plans = grouped(6)
-    assert main(arguments_of(plans, tmp_path / "run", "--config", "markov")) == 0
+    assert (
+        main(arguments_of(plans, tmp_path / "run", "--config", "markov", "--orders", "null", "--prior.order", "3")) == 0
+    )
     printed = " ".join(capsys.readouterr().out.split())
     assert all(words in printed for words in ("5 times more", "--folds 1", "60 held-out plans", "5 folds"))
     assert "*: best on the validation plans" in printed
@@ -51,13 +53,15 @@ def test_each_group_is_held_out_once(tmp_path, capsys):
     assert (found["folds"], found["unit"]) == (5, "groups")
     assert found["plans"] == {"training": 50, "validation": 10, "held_out": 60}
     rows = {row["model"]: row for row in found["rows"]}
-    due = bits_of_folds(plans, 5, lambda fold, training: MarkovPrior(3, 3).fit(training))
+    chosen = load(tmp_path / "run").config
+    assert chosen["order"] == 3
+    due = bits_of_folds(plans, 5, lambda fold, training: MarkovPrior(**chosen).fit(training))
     assert rows["markov"]["bits_per_action"] == pytest.approx(due, rel=1e-5)
     assert rows["uniform"]["bits_per_action"] == pytest.approx(torch.tensor(3.0).log2().item(), rel=1e-5)
     assert rows["uniform"]["more_low"] < rows["uniform"]["more_than_trained"]
     assert all(row["validation_bits"] for row in found["rows"][:-1])
     # The prior that is saved has learned from all groups.
-    whole = MarkovPrior(3, 3).fit(plans)
+    whole = MarkovPrior(**chosen).fit(plans)
     torch.testing.assert_close(load(tmp_path / "run").log_prob(plans.actions), whole.log_prob(plans.actions))
 
 

@@ -3,8 +3,9 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
+import networkx as nx
 import numpy as np
 import pandas as pd
 import torch
@@ -17,9 +18,6 @@ from neuroprior.behaviour.analysis.flat import FlatPlans
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.recordings import Recordings
 from neuroprior.plans import Plans
-
-if TYPE_CHECKING:
-    import networkx as nx
 
 FEWEST_PERMUTATIONS = 99
 """Permutations that are made whatever they cost."""
@@ -98,7 +96,7 @@ class Transitions:
         named = zip(("count", "probability", "low", "high", "p_value"), numbers, strict=True)
         return pd.DataFrame(columns | {name: values[which, a, b].cpu().numpy() for name, values in named})
 
-    def graph(self, group: str = "all") -> "nx.DiGraph":
+    def graph(self, group: str = "all") -> nx.DiGraph:
         """Return the transitions above chance as a networkx graph, for GraphML, Graphviz and other programs.
 
         An edge is a transition whose interval lies above the share of its second action among all that follow another
@@ -110,8 +108,6 @@ class Transitions:
         Raises:
             ValueError: there is no such group.
         """
-        import networkx as nx
-
         if group not in (names := ["all", *self.group_names]):
             raise ValueError(f"`group` must be one of {', '.join(names)}, got {group!r}.")
         number = names.index(group)

@@ -48,7 +48,6 @@ def plans(
             console.print(f"report: {page}. {document.status}", highlight=False, markup=False, soft_wrap=True)
             shown = True
 
-    print(f"reading {' '.join(plans)}", file=sys.stderr, flush=True)
     given: dict[str, Any] = {"priors": priors, "test": test, "skip": skip, "fits": fits, "reading": reading}
     document = report(plans, out=out, figures=figures, command=command, each=show_first, **given)
     show(document, console)

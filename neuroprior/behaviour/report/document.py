@@ -9,8 +9,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
+import networkx as nx
 import pandas as pd
 import rich.table
 from matplotlib.figure import Figure
@@ -22,9 +23,6 @@ from rich.text import Text
 from neuroprior._files import read_json, versions, write_json, write_whole, written_whole
 from neuroprior.behaviour.report.findings import Sentence
 from neuroprior.behaviour.report.page import Section, Table, clean, write_page
-
-if TYPE_CHECKING:
-    import networkx as nx
 
 Column = str | Callable[[Any], str]
 
@@ -71,7 +69,7 @@ class Document:
     keys: Mapping[str, str] = field(default_factory=dict)
     headline: Sequence[Sentence] = ()
     status: str = ""
-    graphs: Mapping[str, "nx.DiGraph"] = field(default_factory=dict)
+    graphs: Mapping[str, nx.DiGraph] = field(default_factory=dict)
 
     @property
     def said(self) -> list[str]:
@@ -195,10 +193,8 @@ def write_frames(folder: Path, frames: Mapping[str, pd.DataFrame]) -> None:
             frame.to_csv(file, index=False, lineterminator="\n")
 
 
-def write_graph(path: Path, graph: "nx.DiGraph") -> None:
+def write_graph(path: Path, graph: nx.DiGraph) -> None:
     """Write a graph as `path` with the endings `.graphml` and `.gv` (Graphviz)."""
-    import networkx as nx
-
     with written_whole(path.with_suffix(".graphml"), "wb") as file:
         nx.write_graphml(nx.relabel_nodes(graph, clean), file)
     quoted = {name: json.dumps(clean(str(name)), ensure_ascii=False) for name in graph}

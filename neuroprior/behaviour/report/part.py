@@ -1,17 +1,15 @@
 """A section of a report on plans with its tables, and what sections share: names, texts of p-values, limits."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+import networkx as nx
 import pandas as pd
 from torch import Tensor
 
 from neuroprior.behaviour.report.findings import Finding
 from neuroprior.behaviour.report.page import Section
 from neuroprior.plans import Plans
-
-if TYPE_CHECKING:
-    import networkx as nx
 
 LISTED = 12
 """Rows that are shown of a table; its file has all."""
@@ -26,7 +24,7 @@ class Part(NamedTuple):
     frames: dict[str, pd.DataFrame]
     verdicts: Sequence[str] = ()
     findings: Sequence[Finding] = ()
-    graphs: Mapping[str, "nx.DiGraph"] = {}
+    graphs: Mapping[str, nx.DiGraph] = {}
 
 
 def action_names(plans: Plans) -> list[str]:

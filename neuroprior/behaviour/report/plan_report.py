@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 
 from neuroprior._checks import check_count
-from neuroprior._jobs import Progress, in_words
+from neuroprior._jobs import Progress, in_words, saying
 from neuroprior._threads import one_thread
 from neuroprior.behaviour.durations.past_durations import PastDurations
 from neuroprior.behaviour.reading.read import read_recordings
@@ -111,7 +111,8 @@ def report(
         check_place(Path(out), ["plans"] if "scores" in sections else [], KEYS)  # before hours of work
     files = plans
     if not isinstance(plans, Plans | Recordings) and is_recording(plans):
-        plans = read_recordings(plans, reading)
+        with saying(f"reading {file}"):
+            plans = read_recordings(plans, reading)
     if priors is None:
         _check_other_files(files, test)
         stages = _cross_validate(plans, test, skip, fits, reading, out, "lags" in sections)

@@ -82,9 +82,10 @@ def test_a_report_has_its_tables_and_figures(made):
     assert {*made.tables, "motifs"} == {
         *("plans", "actions", "lags", "transitions", "transition_test"),
         *("motifs", "drift", "drift_tests", "action_drift"),
+        *("individuals", "individual_budget", "individual_types"),
     }
     assert all(isinstance(frame, pd.DataFrame) for frame in made.tables.values())
-    assert {"scores", "lags", "transitions", "group_transitions", "drift"} <= set(made.figures)
+    assert {"scores", "lags", "transitions", "transition_graph", "individual_strips", "drift"} <= set(made.figures)
     assert all(isinstance(figure, Figure) for figure in made.figures.values())
     boxes = [box for section in made.sections for box in section.figures]
     assert all(isinstance(box, FigureBox) and box.caption and box.alt and box.name for box in boxes)
@@ -150,12 +151,6 @@ def verdicts(document: Document) -> str:
     return "\n".join(texts)
 
 
-def marks(figure: Figure) -> int:
-    """Rings around points, and dots in the cells of matrices."""
-    curves = [line for axes in figure.axes for line in axes.lines]
-    return sum(len(line.get_xdata()) for line in curves if line.get_markersize() == 13 or line.get_ls() == "None")
-
-
 def animals(number: int, sessions: int = 8) -> Plans:
     """Animals that differ: each half repeats its last action more often than the other half."""
     probs = [markov_probs(3, 1, seed, 3) for seed in (0, 1)]
@@ -174,8 +169,7 @@ def test_few_groups_bear_no_verdict(number, enough):
     assert ("*" in said) == enough
     assert ("significant" in said) == enough
     assert ("p" in said.split("\n")) == enough  # the heading of a column
-    assert (marks(whole.figures["group_transitions"]) > 0) == enough
-    assert said.count(few) == (0 if enough else 6)  # the lead, and each section that would draw one
+    assert said.count(few) == (0 if enough else 7)  # the lead, and each section that would draw one
     assert whole.tables["plans"]["low"].notna().all()
     assert "over groups" in " ".join(whole.said)
 
