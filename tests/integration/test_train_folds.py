@@ -43,9 +43,7 @@ def bits_of_folds(plans: Plans, number: int, fit) -> float:
 
 def test_each_group_is_held_out_once(tmp_path, capsys):
     plans = grouped(6)
-    assert (
-        main(arguments_of(plans, tmp_path / "run", "--config", "markov", "--orders", "null", "--prior.order", "3")) == 0
-    )
+    assert main(arguments_of(plans, tmp_path / "run", "--config", "markov", "--prior.order", "3")) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert all(words in printed for words in ("5 times more", "--folds 1", "60 held-out plans", "5 folds"))
     assert "*: best on the validation plans" in printed
