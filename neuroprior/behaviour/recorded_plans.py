@@ -29,6 +29,8 @@ class RecordedPlans(Plans):
             not known; None for plans without times. An end symbol takes no time.
         condition: integers `[N]`: what plans are compared by, such as the treatment of the subject; None for none.
         condition_names: names of the conditions, numbered from 0, or None.
+        stratum: integers `[N]`: within what conditions are compared, such as the sex of the subject; None for none.
+        stratum_names: names of the strata, numbered from 0, or None.
         notes: what the reader of a file has to say of them, a line each.
 
     Raises:
@@ -40,7 +42,7 @@ class RecordedPlans(Plans):
         [[2.0, 1.0]]
     """
 
-    PER_PLAN: ClassVar[tuple[str, ...]] = (*Plans.PER_PLAN, "recording", "condition")
+    PER_PLAN: ClassVar[tuple[str, ...]] = (*Plans.PER_PLAN, "recording", "condition", "stratum")
     PER_ACTION: ClassVar[tuple[str, ...]] = (*Plans.PER_ACTION, "began", "durations")
 
     recording: Sequence[str] | None = None
@@ -48,6 +50,8 @@ class RecordedPlans(Plans):
     durations: Tensor | None = None
     condition: Tensor | None = None
     condition_names: Sequence[str] | None = None
+    stratum: Tensor | None = None
+    stratum_names: Sequence[str] | None = None
     notes: Sequence[str] = ()
 
     def __post_init__(self) -> None:
@@ -64,9 +68,10 @@ class RecordedPlans(Plans):
         if self.durations is not None:
             durations = self._times("durations", self.durations, torch.float32, 0)
             object.__setattr__(self, "durations", durations.masked_fill(~acted, 0))
-        if self.condition is not None:
-            object.__setattr__(self, "condition", as_integers("condition", self.condition, num))
-        check_numbered("condition", self.condition, self.condition_names)
+        for name in ("condition", "stratum"):
+            if (numbers := getattr(self, name)) is not None:
+                object.__setattr__(self, name, as_integers(name, numbers, num))
+            check_numbered(name, getattr(self, name), getattr(self, f"{name}_names"))
         if check_texts("notes", self.notes):
             object.__setattr__(self, "notes", tuple(self.notes))
 

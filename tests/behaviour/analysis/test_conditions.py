@@ -404,7 +404,7 @@ def test_parts_that_fit_the_memory_change_nothing(conditions, monkeypatch):
     plans = study(3, conditions, num_actions=3)
     whole = compare_conditions(plans, 63, seeded(0))
     design = PermutationDesign.of(plans)
-    monkeypatch.setattr("neuroprior.behaviour.analysis.conditions.NUMBERS_AT_ONCE", 60)
+    monkeypatch.setattr("neuroprior.behaviour.analysis.permutation_tests.NUMBERS_AT_ONCE", 60)
     monkeypatch.setattr("neuroprior.behaviour.analysis.condition_chains.CELLS_AT_ONCE", 1000)
     parts = compare_conditions(plans, 63, seeded(0))
     assert parts.tests == whole.tests
