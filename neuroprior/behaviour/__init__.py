@@ -43,6 +43,7 @@ if TYPE_CHECKING:
         by_plan,
         by_position,
     )
+    from neuroprior.behaviour.analysis.interaction import ConditionInteraction, InteractionFamily
     from neuroprior.behaviour.analysis.lags import LagInformation, mutual_information
     from neuroprior.behaviour.analysis.modes import ModeChoice, choose_modes, mode_frame, mode_plans, mode_table
     from neuroprior.behaviour.analysis.motifs import Motif, motifs
@@ -55,7 +56,7 @@ if TYPE_CHECKING:
     from neuroprior.behaviour.reading import Columns, Options, ReadingError, read
     from neuroprior.behaviour.recorded_plans import RecordedPlans
     from neuroprior.behaviour.recordings import Recordings
-    from neuroprior.behaviour.study import simulated_study
+    from neuroprior.behaviour.study import large_study, simulated_study
 
 __all__ = [
     "ActionDrift",
@@ -63,11 +64,13 @@ __all__ = [
     "Columns",
     "ConditionComparison",
     "ConditionFamily",
+    "ConditionInteraction",
     "ConditionPrediction",
     "Difference",
     "DurationLaw",
     "DurationModel",
     "GroupDrift",
+    "InteractionFamily",
     "Interval",
     "LAW_NAMES",
     "LagInformation",
@@ -94,6 +97,7 @@ __all__ = [
     "choose_modes",
     "compare_conditions",
     "holm",
+    "large_study",
     "mean_interval",
     "mode_frame",
     "mode_plans",
@@ -119,6 +123,7 @@ _ROOMS = (
     "neuroprior.behaviour.analysis.comparison",
     "neuroprior.behaviour.analysis.conditions",
     "neuroprior.behaviour.analysis.drift",
+    "neuroprior.behaviour.analysis.interaction",
     "neuroprior.behaviour.analysis.lags",
     "neuroprior.behaviour.analysis.modes",
     "neuroprior.behaviour.analysis.motifs",
