@@ -90,7 +90,9 @@ def study(
     run = JobRun(partial(compared, numbers), Path(out) / "jobs", numbers)
     found = run.do(jobs, processes=processes, dask=dask, title="studies")
     rows = [asdict(job) | row for job, some in zip(jobs, found, strict=True) for row in some]
-    frame = pd.DataFrame(rows).drop(columns="number")
+    frame = pd.DataFrame(
+        rows, columns=["design", "effect", "kind", "study", "level", "test", "p", "corrected", "feature"]
+    )
     tests = frame[frame["kind"] == "test"].drop(columns=["kind", "feature"])
     alarms, power = _shares(tests[~tests["effect"]], "p"), _shares(tests[tests["effect"]], "corrected")
     features = _features(frame[frame["kind"] == "feature"], with_effect)
