@@ -93,18 +93,16 @@ def study(
     frame = pd.DataFrame(
         rows, columns=["design", "effect", "kind", "study", "level", "test", "p", "corrected", "feature"]
     )
-    tests = frame[frame["kind"] == "test"].drop(columns=["kind", "feature"])
-    alarms, power = _shares(tests[~tests["effect"]], "p"), _shares(tests[tests["effect"]], "corrected")
+    tests = _shares(frame[frame["kind"] == "test"])
     features = _features(frame[frame["kind"] == "feature"], with_effect)
-    tables = [_alarm_table(alarms), _power_table(power), _feature_table(features)]
     publish(
         Document(
             "Simulated studies of conditions",
             f"{studies} studies without an effect for each design, {with_effect} with one",
-            [Section("Conditions", tables=tables)],
-            {"false_alarms": alarms, "power": power, "features": features},
+            [Section("Conditions", tables=[_test_table(tests, studies), _feature_table(features)])],
+            {"tests": tests, "features": features},
             numbers,
-            keys={"false_alarms": "rows"},
+            keys={"tests": "rows"},
         ),
         Path(out),
     )
@@ -148,14 +146,19 @@ def recordings_of(events: pd.DataFrame) -> Recordings:
     )
 
 
-def _shares(tests: pd.DataFrame, column: str) -> pd.DataFrame:
-    """The share of studies in which each test is significant, with its interval."""
+def _shares(tests: pd.DataFrame) -> pd.DataFrame:
+    """A row for each design and test: the shares of studies with p < 0.05 without an effect, and with one (corrected).
+
+    `level` is the largest p-value below 0.05 that is possible. All shares have Wilson's interval.
+    """
     rows = []
     for (design, test), own in tests.groupby(["design", "test"], sort=False):
-        share, low, high = share_interval(int((own[column] < LEVEL).sum()), len(own))
-        level = own["level"].iloc[0]
-        row = {"design": design, "test": test, "studies": len(own), "level": level}
-        rows.append(row | {"share": share, "low": low, "high": high})
+        null, effect = own[~own["effect"]], own[own["effect"]]
+        row = {"design": design, "test": test, "level": own["level"].iloc[0], "studies": len(null)}
+        for name, p_values in (("alarms", null["p"]), ("power", effect["corrected"])):
+            values = share_interval(int((p_values < LEVEL).sum()), len(p_values))
+            row |= dict(zip((name, f"{name}_low", f"{name}_high"), values, strict=True))
+        rows.append(row)
     return pd.DataFrame(rows)
 
 
@@ -172,45 +175,36 @@ def _features(found: pd.DataFrame, studies: int) -> pd.DataFrame:
         rows.append((design, "any other transition or duration", False, some[~some["planted"]]["study"].nunique()))
     frame = pd.DataFrame(rows, columns=["design", "feature", "planted", "found"])
     shares = pd.DataFrame([share_interval(number, studies)._asdict() for number in frame["found"]])
-    return pd.concat([frame, shares.rename(columns={"mean": "share"})], axis=1).assign(studies=studies)
+    shares = shares.rename(columns={"mean": "power", "low": "power_low", "high": "power_high"})
+    return pd.concat([frame, shares], axis=1).assign(studies=studies)
 
 
-def _alarm_table(frame: pd.DataFrame) -> Table:
-    studies = int(frame["studies"].iloc[0])
-    low, high = stats.binom.interval(0.95, studies, LEVEL)
-    outside = frame["share"] > high / studies
-    cells = (100 * frame["share"]).map("{:.1f}".format) + outside.map({True: "*", False: " "})
+def _test_table(frame: pd.DataFrame, studies: int) -> Table:
+    most = stats.binom.ppf(0.975, studies, LEVEL) / studies
+    columns: dict[str, Any] = {
+        "design": lambda row: "" if row.test != frame["test"].iloc[0] else str(row.design),
+        "test": "test",
+        "false alarms, %": lambda row: _percent(row, "alarms") + ("*" if row.alarms > most else " "),
+        "power, %": lambda row: _percent(row, "power"),
+    }
     caption = (
-        f"Share of studies without an effect with p < {LEVEL}, %. Of {studies} exact tests {100 * low / studies:.1f} to"
-        f" {100 * high / studies:.1f} % are below it with a probability of 95 %; *: above that. Any star: of a feature,"
-        " corrected for all."
+        f"Shares of studies with p < {LEVEL} without an effect, and with one (corrected), with 95 % intervals (Wilson)."
+        f" *: above {100 * most:.1f} %, which happens in one of 40 exact tests. Any star: of a feature, corrected for"
+        " all features and families. The effect does not depend on the sex."
     )
-    return _wide(frame.assign(cell=cells), "False alarms", caption)
+    return table(frame, columns, caption, "False alarms, and effects found, by test", "llrr")
 
 
-def _power_table(frame: pd.DataFrame) -> Table:
-    caption = f"Share of studies with an effect with a corrected p < {LEVEL}, %; 95 % intervals over studies (Wilson)."
-    caption += " The effect does not depend on the sex."
-    return _wide(frame.assign(cell=[_percent(row) for _, row in frame.iterrows()]), "Effects found, by test", caption)
-
-
-def _wide(frame: pd.DataFrame, title: str, caption: str) -> Table:
-    """A row a design, a column a test."""
-    wide = frame.pivot(index="design", columns="test", values="cell").reindex(frame["design"].unique())
-    wide = wide[frame["test"].unique()].reset_index()
-    columns = {name.replace(" ", "\n"): name for name in wide.columns}
-    return table(wide, columns, caption, title, "l" + "r" * (len(columns) - 1))
-
-
-def _percent(row: Any) -> str:
-    return f"{100 * row.share:.1f} ({100 * row.low:.1f} to {100 * row.high:.1f})"
+def _percent(row: Any, name: str) -> str:
+    share, low, high = (100 * row[column] for column in (name, f"{name}_low", f"{name}_high"))
+    return f"{share:.1f} ({low:.1f} to {high:.1f})"
 
 
 def _feature_table(frame: pd.DataFrame) -> Table:
     columns: dict[str, Any] = {
         "design": "design",
         "feature": "feature",
-        "found, %": _percent,
+        "found, %": lambda row: _percent(row, "power"),
     }
     caption = "Share of studies with an effect in which the feature is significant (corrected)."
     return table(frame, columns, caption, "Effects found, by feature", "llr")
