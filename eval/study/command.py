@@ -2,16 +2,18 @@
 
 from dataclasses import asdict, dataclass
 from functools import partial
+from math import ceil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import torch
 from jsonargparse.typing import NonNegativeInt, PositiveInt
 from scipy import stats
 
 from neuroprior._jobs import JobRun
-from neuroprior.behaviour import Columns, compare_conditions, read, share_interval, simulated_study
+from neuroprior.behaviour import Recordings, compare_conditions, share_interval, simulated_study
 from neuroprior.behaviour.report.document import Document, publish, table
 from neuroprior.behaviour.report.page import Section, Table
 from neuroprior.behaviour.study import LONGER, MOVED
@@ -20,33 +22,44 @@ LEVEL = 0.05
 TOGETHER = 10
 """Studies of one job."""
 
-COLUMNS = Columns(behaviour="behaviour", recording="session", subject="animal", factors="treatment")
-
 PLANTED = {("transitions", MOVED[0], MOVED[1]), ("transitions", MOVED[0], MOVED[2]), ("durations", LONGER[0])}
 """The features that the treatment changes; shares of actions and of longer sequences change as a consequence."""
+
+DESIGNS: dict[str, dict[str, Any]] = {
+    "6 against 6": {"animals": 12},
+    "6 against 6, sessions alike": {"animals": 12, "alike": True},
+    "12 against 12": {"animals": 24},
+    "5 against 11, unequal lengths": {"animals": 16, "treated": 5, "unequal": 10.0},
+    "8 paired": {"animals": 8, "within": True},
+    "8 paired, sessions alike": {"animals": 8, "within": True, "alike": True},
+    "8 against 8 in two sexes": {"animals": 16, "sex_effect": 0.5},
+    "the same, sex not named": {"animals": 16, "sex_effect": 0.5},
+}
+"""Options of `neuroprior.behaviour.simulated_study` for each design."""
+
+WITHOUT_STRATA = ("the same, sex not named",)
+
+STAR, INTERACTION = "any star", "interaction with sex"
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Some simulated studies of one kind."""
+    """Some simulated studies of one design."""
 
+    design: str
     effect: bool
-    within: bool
-    alike: bool
     number: int
 
     def __str__(self) -> str:
-        words = ["effect" if self.effect else "none", self.design, *["alike"] * self.alike]
-        return f"{'-'.join(words)}-{self.number}"
-
-    @property
-    def design(self) -> str:
-        return "within" if self.within else "between"
+        name = self.design.replace(",", "").replace(" ", "-")
+        return f"{'effect' if self.effect else 'none'}-{name}-{self.number}"
 
 
 def study(
-    studies: PositiveInt = 200,
-    with_effect: PositiveInt = 50,
+    studies: PositiveInt = 1000,
+    with_effect: PositiveInt = 200,
+    actions: PositiveInt = 100,
+    permutations: PositiveInt = 999,
     seed: NonNegativeInt = 0,
     processes: PositiveInt | None = None,
     dask: str | None = None,
@@ -54,39 +67,42 @@ def study(
 ) -> None:
     """Simulated studies with known truth: how often each test of conditions finds an effect that is there, or is not.
 
-    Twelve animals, two sessions each: six of them treated, or each once; see `neuroprior.behaviour.simulated_study`.
+    Animals with two sessions each; see `neuroprior.behaviour.simulated_study`.
 
     Args:
         studies: simulated studies without an effect, for each design.
         with_effect: simulated studies with one.
+        actions: behaviours in each session.
+        permutations: random ones of each test at most.
         seed: of the first study; the others follow.
         processes: how many run at a time; all cores by default.
         dask: address of a Dask scheduler; None: this machine.
         out: folder for tables (CSV), `results.json` and `report.html`.
     """
     jobs = [
-        Batch(effect, within, alike, number)
-        for effect, alike in ((True, False), (False, False), (False, True))
-        for within in (False, True)
+        Batch(design, effect, number)
+        for effect in (True, False)
+        for design in DESIGNS
         for number in range(-(-(with_effect if effect else studies) // TOGETHER))
     ]
-    numbers = {"studies": studies, "with_effect": with_effect, "seed": seed}
+    numbers = {"studies": studies, "with_effect": with_effect, "actions": actions, "permutations": permutations}
+    numbers["seed"] = seed
     run = JobRun(partial(compared, numbers), Path(out) / "jobs", numbers)
     found = run.do(jobs, processes=processes, dask=dask, title="studies")
     rows = [asdict(job) | row for job, some in zip(jobs, found, strict=True) for row in some]
-    frame = pd.DataFrame(rows).drop(columns="number")
-    frame["design"] = frame["within"].map({True: "within", False: "between"})
-    tests = frame[frame["kind"] == "test"].drop(columns=["kind", "feature"])
-    alarms, power = _shares(tests[~tests["effect"]], "p"), _shares(tests[tests["effect"]], "corrected")
+    frame = pd.DataFrame(
+        rows, columns=["design", "effect", "kind", "study", "level", "test", "p", "corrected", "feature"]
+    )
+    tests = _shares(frame[frame["kind"] == "test"])
     features = _features(frame[frame["kind"] == "feature"], with_effect)
     publish(
         Document(
             "Simulated studies of conditions",
-            f"{studies} studies without an effect for each design, {with_effect} with one; 12 animals, 2 sessions each",
-            [Section("Conditions", tables=[_alarm_table(alarms), _power_table(power), _feature_table(features)])],
-            {"false_alarms": alarms, "power": power, "features": features},
+            f"{studies} studies without an effect for each design, {with_effect} with one",
+            [Section("Conditions", tables=[_test_table(tests, studies), _feature_table(features)])],
+            {"tests": tests, "features": features},
             numbers,
-            keys={"false_alarms": "rows"},
+            keys={"tests": "rows"},
         ),
         Path(out),
     )
@@ -96,29 +112,53 @@ def compared(numbers: dict[str, int], batch: Batch) -> list[dict[str, Any]]:
     """The p-values of every test in each study of a batch, and the features that were found to differ."""
     total = numbers["with_effect"] if batch.effect else numbers["studies"]
     first = batch.number * TOGETHER
+    strata: list[str] | None = [] if batch.design in WITHOUT_STRATA else None
     rows = []
     for number in range(first, min(first + TOGETHER, total)):
         seed = numbers["seed"] + number
-        events = simulated_study(seed, effect=batch.effect, within=batch.within, alike=batch.alike)
-        plans = read(events, COLUMNS).plans()
+        events = simulated_study(seed, effect=batch.effect, actions=numbers["actions"], **DESIGNS[batch.design])
+        plans = recordings_of(events).plans(compare="treatment", reference="saline", strata=strata)
         names = list(plans.action_names or ())
-        one = compare_conditions(plans, generator=torch.Generator().manual_seed(seed))
-        tests = one.tests | {"all together": (one.p_value, one.p_value)}
-        rows += [{"kind": "test", "study": seed, "test": t, "p": p, "corrected": c} for t, (p, c) in tests.items()]
+        one = compare_conditions(plans, numbers["permutations"], torch.Generator().manual_seed(seed))
+        starred = any(bool(one.significant(family).any()) for family in one.families)
+        tests = one.tests | {"all together": (one.p_value, one.p_value), STAR: (1.0 - starred, 1.0 - starred)}
+        tests |= {} if one.interaction is None else {INTERACTION: (one.interaction.p_value, one.interaction.p_value)}
+        level = (ceil(LEVEL / one.smallest_p - 1e-9) - 1) * one.smallest_p
+        common = {"study": seed, "level": level}
+        rows += [{"kind": "test", **common, "test": name, "p": p, "corrected": c} for name, (p, c) in tests.items()]
         for family in one.families:
             for feature in one.significant(family).nonzero()[:, 0].tolist():
                 spelled = " ".join(names[action] for action in family.features[feature].tolist())
-                rows.append({"kind": "feature", "study": seed, "test": family.name, "feature": spelled})
+                rows.append({"kind": "feature", **common, "test": family.name, "feature": spelled})
     return rows
 
 
-def _shares(tests: pd.DataFrame, column: str) -> pd.DataFrame:
-    """The share of studies in which each test is significant, with its interval."""
+def recordings_of(events: pd.DataFrame) -> Recordings:
+    """Return what `neuroprior.behaviour.read` finds in a simulated study, without its checks, which take longer."""
+    missing = events["behaviour"].isna().to_numpy()
+    recording = (events["animal"] + " " + events["session"].astype(str)).factorize()[0]
+    fragment = np.cumsum((np.diff(recording, prepend=-1) != 0) | missing | np.append(False, missing[:-1]))
+    columns = {"animal": "subject", "session": "recording"}
+    kept = events[~missing].rename(columns=columns).drop(columns="observer").astype({"recording": str})
+    factors = [name for name in ("treatment", "sex") if name in events]
+    return Recordings(
+        kept.reset_index(drop=True), np.unique(fragment[~missing], return_inverse=True)[1], "s", (), factors
+    )
+
+
+def _shares(tests: pd.DataFrame) -> pd.DataFrame:
+    """A row for each design and test: the shares of studies with p < 0.05 without an effect, and with one (corrected).
+
+    `level` is the largest p-value below 0.05 that is possible. All shares have Wilson's interval.
+    """
     rows = []
-    for (design, alike, test), own in tests.groupby(["design", "alike", "test"], sort=False):
-        share, low, high = share_interval(int((own[column] < LEVEL).sum()), len(own))
-        row = {"design": design, "sessions_alike": alike, "test": test, "studies": len(own)}
-        rows.append(row | {"share": share, "low": low, "high": high})
+    for (design, test), own in tests.groupby(["design", "test"], sort=False):
+        null, effect = own[~own["effect"]], own[own["effect"]]
+        row = {"design": design, "test": test, "level": own["level"].iloc[0], "studies": len(null)}
+        for name, p_values in (("alarms", null["p"]), ("power", effect["corrected"])):
+            values = share_interval(int((p_values < LEVEL).sum()), len(p_values))
+            row |= dict(zip((name, f"{name}_low", f"{name}_high"), values, strict=True))
+        rows.append(row)
     return pd.DataFrame(rows)
 
 
@@ -127,7 +167,7 @@ def _features(found: pd.DataFrame, studies: int) -> pd.DataFrame:
     own = found[found["effect"] & found["test"].isin(["transitions", "durations"])]
     own = own.assign(planted=(own["test"] + " " + own["feature"]).isin([" ".join(words) for words in PLANTED]))
     rows = []
-    for design in ("between", "within"):
+    for design in DESIGNS:
         some = own[own["design"] == design]
         for test, *names in sorted(PLANTED):
             here = some[(some["test"] == test) & (some["feature"] == " ".join(names))]
@@ -135,43 +175,36 @@ def _features(found: pd.DataFrame, studies: int) -> pd.DataFrame:
         rows.append((design, "any other transition or duration", False, some[~some["planted"]]["study"].nunique()))
     frame = pd.DataFrame(rows, columns=["design", "feature", "planted", "found"])
     shares = pd.DataFrame([share_interval(number, studies)._asdict() for number in frame["found"]])
-    return pd.concat([frame, shares.rename(columns={"mean": "share"})], axis=1).assign(studies=studies)
+    shares = shares.rename(columns={"mean": "power", "low": "power_low", "high": "power_high"})
+    return pd.concat([frame, shares], axis=1).assign(studies=studies)
 
 
-def _alarm_table(frame: pd.DataFrame) -> Table:
-    studies = int(frame["studies"].iloc[0])
-    low, high = stats.binom.interval(0.95, studies, LEVEL)
-    outside = ~frame["share"].between(low / studies, high / studies)
-    cells = (100 * frame["share"]).map("{:.1f}".format) + outside.map({True: "*", False: " "})
+def _test_table(frame: pd.DataFrame, studies: int) -> Table:
+    most = stats.binom.ppf(0.975, studies, LEVEL) / studies
+    columns: dict[str, Any] = {
+        "design": lambda row: "" if row.test != frame["test"].iloc[0] else str(row.design),
+        "test": "test",
+        "false alarms, %": lambda row: _percent(row, "alarms") + ("*" if row.alarms > most else " "),
+        "power, %": lambda row: _percent(row, "power"),
+    }
     caption = (
-        f"Share of studies without an effect with p < {LEVEL}, %. Of {studies} exact tests {100 * low / studies:.1f} to"
-        f" {100 * high / studies:.1f} % are below it with a probability of 95 %; *: outside of that."
+        f"Shares of studies with p < {LEVEL} without an effect, and with one (corrected), with 95 % intervals (Wilson)."
+        f" *: above {100 * most:.1f} %, which happens in one of 40 exact tests. Any star: of a feature, corrected for"
+        " all features and families. The effect does not depend on the sex."
     )
-    return _wide(frame.assign(cell=cells), "False alarms", caption)
+    return table(frame, columns, caption, "False alarms, and effects found, by test", "llrr")
 
 
-def _power_table(frame: pd.DataFrame) -> Table:
-    caption = f"Share of studies with an effect with a corrected p < {LEVEL}, %; 95 % intervals over studies (Wilson)."
-    return _wide(frame.assign(cell=[_percent(row) for _, row in frame.iterrows()]), "Effects found, by test", caption)
-
-
-def _wide(frame: pd.DataFrame, title: str, caption: str) -> Table:
-    """A row a test, a column a design."""
-    cells = frame.assign(where=frame["design"] + frame["sessions_alike"].map({True: "\nalike", False: ""}))
-    wide = cells.pivot(index="test", columns="where", values="cell").reindex(cells["test"].unique())
-    wide = wide[cells["where"].unique()].reset_index()
-    return table(wide, {name: name for name in wide.columns}, caption, title, "l" + "r" * (len(wide.columns) - 1))
-
-
-def _percent(row: Any) -> str:
-    return f"{100 * row.share:.1f} ({100 * row.low:.1f} to {100 * row.high:.1f})"
+def _percent(row: Any, name: str) -> str:
+    share, low, high = (100 * row[column] for column in (name, f"{name}_low", f"{name}_high"))
+    return f"{share:.1f} ({low:.1f} to {high:.1f})"
 
 
 def _feature_table(frame: pd.DataFrame) -> Table:
     columns: dict[str, Any] = {
         "design": "design",
         "feature": "feature",
-        "found, %": _percent,
+        "found, %": lambda row: _percent(row, "power"),
     }
     caption = "Share of studies with an effect in which the feature is significant (corrected)."
     return table(frame, columns, caption, "Effects found, by feature", "llr")

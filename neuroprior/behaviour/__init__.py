@@ -44,6 +44,7 @@ if TYPE_CHECKING:
         by_position,
     )
     from neuroprior.behaviour.analysis.individuals import Individuals, Types, individual_types, individuals
+    from neuroprior.behaviour.analysis.interaction import ConditionInteraction, InteractionFamily
     from neuroprior.behaviour.analysis.lags import LagInformation, mutual_information
     from neuroprior.behaviour.analysis.modes import ModeChoice, choose_modes, mode_frame, mode_plans, mode_table
     from neuroprior.behaviour.analysis.motifs import Motif, motifs
@@ -56,7 +57,7 @@ if TYPE_CHECKING:
     from neuroprior.behaviour.reading import Columns, Options, ReadingError, read
     from neuroprior.behaviour.recorded_plans import RecordedPlans
     from neuroprior.behaviour.recordings import Recordings
-    from neuroprior.behaviour.study import simulated_study
+    from neuroprior.behaviour.study import large_study, simulated_study
 
 __all__ = [
     "ActionDrift",
@@ -64,12 +65,14 @@ __all__ = [
     "Columns",
     "ConditionComparison",
     "ConditionFamily",
+    "ConditionInteraction",
     "ConditionPrediction",
     "Difference",
     "DurationLaw",
     "DurationModel",
     "GroupDrift",
     "Individuals",
+    "InteractionFamily",
     "Interval",
     "LAW_NAMES",
     "LagInformation",
@@ -99,6 +102,7 @@ __all__ = [
     "holm",
     "individual_types",
     "individuals",
+    "large_study",
     "mean_interval",
     "mode_frame",
     "mode_plans",
@@ -125,6 +129,7 @@ _ROOMS = (
     "neuroprior.behaviour.analysis.conditions",
     "neuroprior.behaviour.analysis.drift",
     "neuroprior.behaviour.analysis.individuals",
+    "neuroprior.behaviour.analysis.interaction",
     "neuroprior.behaviour.analysis.lags",
     "neuroprior.behaviour.analysis.modes",
     "neuroprior.behaviour.analysis.motifs",

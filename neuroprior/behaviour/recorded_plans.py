@@ -29,6 +29,8 @@ class RecordedPlans(Plans):
             not known; None for plans without times. An end symbol takes no time.
         condition: integers `[N]`: what plans are compared by, such as the treatment of the subject; None for none.
         condition_names: names of the conditions, numbered from 0, or None.
+        stratum: integers `[N]`: within what conditions are compared, such as the sex of the subject; None for none.
+        stratum_names: names of the strata, numbered from 0, or None.
         notes: what the reader of a file has to say of them, a line each.
 
     Raises:
@@ -40,7 +42,7 @@ class RecordedPlans(Plans):
         [[2.0, 1.0]]
     """
 
-    PER_PLAN: ClassVar[tuple[str, ...]] = (*Plans.PER_PLAN, "recording", "condition")
+    PER_PLAN: ClassVar[tuple[str, ...]] = (*Plans.PER_PLAN, "recording", "condition", "stratum")
     PER_ACTION: ClassVar[tuple[str, ...]] = (*Plans.PER_ACTION, "began", "durations")
 
     recording: Sequence[str] | None = None
@@ -48,6 +50,8 @@ class RecordedPlans(Plans):
     durations: Tensor | None = None
     condition: Tensor | None = None
     condition_names: Sequence[str] | None = None
+    stratum: Tensor | None = None
+    stratum_names: Sequence[str] | None = None
     notes: Sequence[str] = ()
 
     def __post_init__(self) -> None:
@@ -64,9 +68,10 @@ class RecordedPlans(Plans):
         if self.durations is not None:
             durations = self._times("durations", self.durations, torch.float32, 0)
             object.__setattr__(self, "durations", durations.masked_fill(~acted, 0))
-        if self.condition is not None:
-            object.__setattr__(self, "condition", as_integers("condition", self.condition, num))
-        check_numbered("condition", self.condition, self.condition_names)
+        for name in ("condition", "stratum"):
+            if (numbers := getattr(self, name)) is not None:
+                object.__setattr__(self, name, as_integers(name, numbers, num))
+            check_numbered(name, getattr(self, name), getattr(self, f"{name}_names"))
         if check_texts("notes", self.notes):
             object.__setattr__(self, "notes", tuple(self.notes))
 
@@ -153,8 +158,10 @@ def plans_of_events(
     events: pd.DataFrame,
     fragment: NDArray[np.int64],
     *,
-    factor: str | None,
+    factors: Sequence[str],
+    compare: str | None,
     reference: str | None,
+    strata: Sequence[str] | None,
     context: Sequence[str],
     notes: list[str],
     max_gap: float | None,
@@ -166,8 +173,8 @@ def plans_of_events(
 
     Args:
         events, fragment: of `Recordings`, of one observer.
-        factor: the column of the condition; None for none.
-        reference: its level that comes first; None: the first by name.
+        factors: columns of what recordings can be compared by.
+        compare, reference, strata: as of `Recordings.plans`.
         context: columns of what is observed before each action.
         notes: of the recordings; further ones are added.
         max_gap, num_actions, action_names, unknown: as of `Recordings.plans`.
@@ -224,17 +231,12 @@ def plans_of_events(
     is_independent = len(subjects) == len(first) and bool((events["subject"] == events["recording"]).all())
     began = events["start"].to_numpy(np.float64)
     durations = (events["stop"] - events["start"]).to_numpy(np.float32)
-    if reference is not None and factor is None:
-        raise ValueError(f"`reference` must be a level of a factor, got {reference!r}; name the factor (--compare)")
+    if reference is not None and not factors:
+        raise ValueError(f"`reference` must be a level of a factor, got {reference!r}; name its column")
     fields: dict[str, Any] = _context_fields(context, events, pad, notes)
-    if factor is not None:
-        names_of = sorted(pd.unique(first[factor]), key=lambda level: (level != reference, str(level)))
-        if reference is not None and reference not in names_of:
-            raise ValueError(f"`reference` must be one of {', '.join(names_of)}, got {reference!r}")
-        codes, levels = pd.Index(names_of).get_indexer(pd.Index(first[factor])), names_of
-        if (codes < 0).any() or "" in set(levels):
-            raise ValueError(f"`condition` must be known for each recording, got empty cells of {factor!r}")
-        fields |= {"condition": torch.from_numpy(codes.astype(np.int64)), "condition_names": tuple(map(str, levels))}
+    if factors:
+        unit = np.arange(len(first)) if is_independent else group
+        fields |= _design_fields(first, unit, factors, compare, reference, strata, notes)
     return RecordedPlans(
         pad(actions),
         count,
@@ -249,6 +251,58 @@ def plans_of_events(
         notes=tuple(notes),
         **fields,
     )
+
+
+def _design_fields(
+    first: pd.DataFrame,
+    unit: NDArray[np.int64],
+    factors: Sequence[str],
+    compare: str | None,
+    reference: str | None,
+    strata: Sequence[str] | None,
+    notes: list[str],
+) -> dict[str, Any]:
+    """Return the fields `condition` and `stratum` of plans, with their names.
+
+    Args:
+        first: the first event of each plan.
+        unit: int `[plans]`: the subject of each.
+        factors, compare, reference, strata, notes: as of `plans_of_events`.
+    """
+    several = [name for name in factors if first[name].nunique() > 1]
+    factor = compare or (several or list(factors))[0]
+    levels = sorted(pd.unique(first[factor]), key=lambda level: (level != reference, str(level)))
+    if "" in levels:
+        raise ValueError(f"`compare` must be known for each recording, got empty cells of {factor!r}")
+    if reference is not None and reference not in levels:
+        raise ValueError(f"`reference` must be one of {', '.join(levels)}, got {reference!r}")
+    codes = pd.Index(levels).get_indexer(pd.Index(first[factor])).astype(np.int64)
+    fields: dict[str, Any] = {"condition": torch.from_numpy(codes), "condition_names": tuple(map(str, levels))}
+    if factor in (strata or ()):
+        raise ValueError(f"`strata` must be other factors than the one that is compared, got {factor!r}")
+    paired = bool((pd.Series(codes).groupby(unit).nunique() > 1).any())
+    chosen: list[str] = []
+    for name in [name for name in several if name != factor] if strata is None else strata:
+        problem = ""
+        if (first[name].groupby(unit).nunique() > 1).any():
+            problem = "varies within a subject"
+        elif (first[name] == "").any():
+            problem = "is not known for each recording"
+        elif not paired and strata is None:
+            text = first[[*chosen, name]].agg(", ".join, axis=1).to_numpy()
+            if (pd.Series(codes).groupby(text).nunique() < 2).any():
+                problem = f"has a level with one level of {factor!r} alone"
+        if problem and strata is not None:
+            raise ValueError(f"`strata` must be known and constant for each subject, got {name!r}, which {problem}")
+        notes += [f"{name!r} {problem}: {factor!r} is not compared within its levels"] if problem else []
+        chosen += [] if problem else [name]
+    if len(several) > 1 and compare is None:
+        within = f" within the levels of {listed(chosen)}" if chosen else ""
+        notes.append(f"of the factors {listed(several)}, {factor!r} is compared{within}; --compare chooses another")
+    if chosen:
+        number, names = pd.factorize(first[chosen].agg(", ".join, axis=1), sort=True)
+        fields |= {"stratum": torch.from_numpy(number.astype(np.int64)), "stratum_names": tuple(map(str, names))}
+    return fields
 
 
 def _pauses(events: pd.DataFrame, cut: NDArray[np.bool_], max_gap: float, notes: list[str]) -> NDArray[np.bool_]:

@@ -260,8 +260,9 @@ class Recordings:
         self,
         *,
         max_gap: float | None = None,
-        condition: str | None = None,
+        compare: str | None = None,
         reference: str | None = None,
+        strata: Sequence[str] | None = None,
         num_actions: int | None = None,
         action_names: Sequence[str] | None = None,
         unknown: str = "error",
@@ -270,8 +271,10 @@ class Recordings:
 
         Args:
             max_gap: a longer pause ends a plan as well; in the unit of the recordings.
-            condition: the factor that is compared; None: the only one, if there is one.
+            compare: the factor that is compared; None: the first that has two levels.
             reference: its level that others are compared with, such as "saline"; None: the first by name.
+            strata: factors, such as sex, within whose levels it is compared; None: the others, but for those that vary
+                within a subject, and those with a level in which nothing can be compared.
             num_actions: A, where behaviours are numbers; None: the largest + 1.
             action_names: A names in the order of their numbers; None: the behaviours that occur, sorted.
             unknown: what a behaviour is that is none of `action_names`: an "error", or a "gap" where a plan ends.
@@ -281,15 +284,19 @@ class Recordings:
         """
         from neuroprior.behaviour.recorded_plans import plans_of_events
 
-        if condition is not None and condition not in self.factors:
-            factors = ", ".join(self.factors) or "of which there is none; name its column (--columns.factors)"
-            raise ValueError(f"`condition` must be a factor of the recordings, {factors}, got {condition!r}")
+        strata = [strata] if isinstance(strata, str) else strata
+        for name, factor in [("compare", compare)] * (compare is not None) + [("strata", one) for one in strata or ()]:
+            if factor not in self.factors:
+                factors = ", ".join(self.factors) or "of which there is none; name its column (--columns.factors)"
+                raise ValueError(f"`{name}` must be a factor of the recordings, {factors}, got {factor!r}")
         recordings = self.of_one_observer()
         return plans_of_events(
             recordings.events,
             recordings.fragment,
-            factor=condition or (self.factors[0] if len(self.factors) == 1 else None),
+            factors=self.factors,
+            compare=compare,
             reference=reference,
+            strata=strata,
             context=recordings.context,
             notes=list(recordings.notes),
             max_gap=max_gap,

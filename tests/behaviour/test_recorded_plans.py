@@ -21,6 +21,8 @@ FIELDS = {
     "durations": torch.tensor([[2.5, 1.5, NAN], [0.0, 3.0, 0.0], [7.0, 0.0, 0.0]]),
     "condition": torch.tensor([1, 1, 0]),
     "condition_names": ("drug", "saline"),
+    "stratum": torch.tensor([1, 0, 1]),
+    "stratum_names": ("female", "male"),
     "notes": ("2 rows have no label",),
 }
 PLANS = RecordedPlans(
@@ -91,7 +93,7 @@ def test_plain_plans_are_recorded_plans_without_times():
 def test_npz_files_hold_everything_and_others_refuse_it(tmp_path):
     write_plans(PLANS, tmp_path / "a.npz")
     back = ReadOptions().read(str(tmp_path / "a.npz"))
-    for name in ("actions", "lengths", "group", "condition"):
+    for name in ("actions", "lengths", "group", "condition", "stratum"):
         assert getattr(back, name).equal(getattr(PLANS, name)), name
     for name in ("began", "durations"):
         assert getattr(back, name).dtype == getattr(PLANS, name).dtype
@@ -109,9 +111,11 @@ def test_npz_files_hold_everything_and_others_refuse_it(tmp_path):
         warnings.simplefilter("error")
         assert read_plans(tmp_path / "plain.npz").actions.equal(PLANS.actions)
     for name in ("a.jsonl", "a.csv"):
-        with refuses(name, "recording, condition, began, durations of RecordedPlans are written to .npz files only"):
+        with refuses(
+            name, "recording, condition, stratum, began, durations of RecordedPlans are written to .npz files only"
+        ):
             write_plans(PLANS, tmp_path / name)
-    with refuses("mice/a-v0: recording, condition, began, durations of RecordedPlans"):
+    with refuses("mice/a-v0: recording, condition, stratum, began, durations of RecordedPlans"):
         write_minari(PLANS, "mice/a-v0")
 
 

@@ -4,8 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from neuroprior.behaviour import read
+from neuroprior.behaviour import PermutationDesign, read
 from neuroprior.behaviour.recordings import near_names
+from tests.support.sources import refuses
 
 TABLE = pd.DataFrame(
     [
@@ -130,3 +131,79 @@ def test_the_summary_says_what_was_read():
         assert words in said
     assert [line.split() for line in said.splitlines() if line.startswith("walk ")] == [["walk", "3", "1", "5"]]
     assert [line.split() for line in said.splitlines() if line.startswith("m1 ")] == [["m1", "1", "1"]]
+
+
+def factor_table(rows):
+    """Two recordings of each animal; `rows` are animal, treatment, sex, day of each."""
+    names = ["animal", "treatment", "sex", "day"]
+    events = [
+        (*row, f"s{number}", behaviour, t, t + 1.0)
+        for number, row in enumerate(rows)
+        for t, behaviour in enumerate(["rest", "walk", "eat"])
+    ]
+    return pd.DataFrame(events, columns=[*names, "session", "behaviour", "start", "stop"])
+
+
+BETWEEN = [
+    *(("m1", "drug", "f", "1"), ("m1", "drug", "f", "2"), ("m2", "saline", "f", "1"), ("m2", "saline", "f", "2")),
+    *(("m3", "saline", "m", "1"), ("m4", "drug", "m", "2"), ("m5", "drug", "m", "1")),
+]
+FACTORS = ["treatment", "sex", "day"]
+
+
+def plans_by(rows, columns=FACTORS, **options):
+    table = factor_table(rows)
+    return read(table, columns={"behaviour": "behaviour", "factors": columns}).plans(**options)
+
+
+def test_one_factor_is_compared_within_the_levels_of_others():
+    plans = plans_by(BETWEEN, reference="saline")
+    assert plans.condition_names == ("saline", "drug")
+    assert plans.condition.tolist() == [1, 1, 0, 0, 0, 1, 1]
+    assert plans.stratum_names == ("f", "m")
+    assert plans.stratum.tolist() == [0, 0, 0, 0, 1, 1, 1]
+    assert "'day' varies within a subject: 'treatment' is not compared within its levels" in plans.notes
+    said = "of the factors treatment, sex, day, 'treatment' is compared within the levels of sex;"
+    said += " --compare chooses another"
+    assert said in plans.notes
+    named = plans_by(BETWEEN, compare="treatment", reference="saline")
+    assert said not in named.notes
+    assert named.stratum.equal(plans.stratum)
+    assert plans_by(BETWEEN, compare="treatment", strata=[]).stratum is None
+
+
+def test_another_factor_may_be_compared_and_days_are_paired():
+    plans = plans_by(BETWEEN, compare="day")
+    assert plans.condition_names == ("1", "2")
+    assert plans.condition.tolist() == [0, 1, 0, 1, 0, 1, 0]
+    # Within subjects every subject is compared with itself, and both others are strata of subjects.
+    assert plans.stratum_names == ("drug, f", "drug, m", "saline, f", "saline, m")
+    design = PermutationDesign.of(plans)
+    assert (design.kind, design.units.tolist(), design.left_out.tolist()) == ("within", [0, 1], [2, 3, 4])
+
+
+def test_factors_that_would_leave_nothing_to_compare_are_no_strata():
+    rows = [("m1", "drug", "f", "1"), ("m2", "saline", "m", "1"), ("m3", "drug", "f", "1")]
+    plans = plans_by(rows)
+    assert plans.stratum is None
+    assert (
+        "'sex' has a level with one level of 'treatment' alone: 'treatment' is not compared within its levels"
+        in plans.notes
+    )
+    assert plans_by(rows, strata="sex").stratum.tolist() == [0, 1, 0]
+    assert plans_by(rows, ["day", "treatment"]).condition_names == ("drug", "saline")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"compare": "dose"}, ("`compare` must be a factor of the recordings, treatment, sex, day, got 'dose'",)),
+        ({"strata": ["dose"]}, ("`strata` must be a factor of the recordings, treatment, sex, day, got 'dose'",)),
+        ({"strata": ["day"]}, ("`strata` must be known and constant for each subject, got 'day', which varies",)),
+        ({"strata": ["treatment"]}, ("`strata` must be other factors", "'treatment'")),
+        ({"reference": "vehicle"}, ("`reference` must be one of drug, saline, got 'vehicle'",)),
+    ],
+)
+def test_wrong_designs_are_refused(options, words):
+    with refuses(*words):
+        plans_by(BETWEEN, **options)

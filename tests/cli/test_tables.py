@@ -71,3 +71,38 @@ def test_bad_options_are_one_line(options, words, table, capsys):
     said = capsys.readouterr().err
     assert words in said
     assert said.count("\n") == 1
+
+
+def test_factors_are_compared_within_others(tmp_path, monkeypatch, capsys):
+    """Days vary within animals; sexes, of which one is treated more often, are strata."""
+    monkeypatch.chdir(tmp_path)
+    rows = [
+        (f"m{n}", day, ("drug", "saline", "vehicle")[n % 3], "fm"[n > 7], "abc"[(t * t + n * day) % 3], t)
+        for n in range(15)
+        for day in (1, 2)
+        for t in range(30)
+    ]
+    pd.DataFrame(rows, columns=["animal", "day", "treatment", "sex", "behaviour", "t"]).to_csv("lab.csv", index=False)
+    columns = ["--columns.behaviour", "behaviour", "--columns.start", "t", "--columns.recording", "day"]
+    columns += ["--columns.factors", "treatment", "sex", "day"]
+    quick = ["--models", "counts", "--folds", "2", "--processes", "1", "--out"]
+    design = ["--compare", "treatment", "--reference", "vehicle"]
+    assert main(["report", "lab.csv", *columns, *design, *quick, "report"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "'day' varies within a subject" in said
+    assert "between the 3 conditions" in said
+    assert pd.read_csv("report/condition_pairs.csv")["first"].unique().tolist() == ["vehicle", "drug"]
+    assert {"difference, f", "difference, m"} <= {*pd.read_csv("report/condition_interaction.csv").columns}
+    assert main(["report", "lab.csv", *columns, *design, "--strata", *quick, "without"]) == 0
+    assert not Path("without/condition_interaction.csv").exists()
+    assert main(["report", "lab.csv", *columns, "--compare", "dose", *quick, "wrong"]) == 2
+    assert "`compare` must be a factor of the recordings, treatment, sex, day, got 'dose'" in capsys.readouterr().err
+
+
+def test_the_large_example_is_read_and_checked(tmp_path, capsys):
+    place = str(tmp_path / "large.csv")
+    assert main(["example", place, "--study", "large"]) == 0
+    assert f"neuroprior check {place} --columns.observer observer" in capsys.readouterr().out
+    assert main(["check", place, "--columns.observer", "observer"]) == 0
+    assert "24 recordings of 24 subjects" in capsys.readouterr().out
+    assert main(["example", str(tmp_path / "other.csv"), "--study", "huge"]) == 2

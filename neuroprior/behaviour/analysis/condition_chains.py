@@ -63,6 +63,8 @@ class ConditionChains:
         p(b | a)   = (n(a b) + s p(b)) / (n(a) + s)            the chain that does not know the condition
         p_k(b | a) = (n_k(a b) + s p(b | a)) / (n_k(a) + s)    the chain that does
 
+    With strata, a and b are counted after a in the stratum of the block, and b alone in all.
+
     Attributes:
         unknown: float64 `[B]`: the log2-likelihood of each block under the chain that does not know the condition.
     """
@@ -74,10 +76,11 @@ class ConditionChains:
     _prior: Tensor  # float64 [Z, 1]: p(b | a) without the unit
 
     @staticmethod
-    def of(flat: FlatPlans, block: Tensor, unit: Tensor) -> "ConditionChains":
-        """From the actions of plans; `block [M]` of each action, `unit [B]` of each block, ascending."""
+    def of(flat: FlatPlans, block: Tensor, unit: Tensor, stratum: Tensor) -> "ConditionChains":
+        """From the actions of plans; `block [M]` of each; `unit [B]`, ascending, and `stratum [B]` of each block."""
         size, last = flat.num_actions, flat.actions.roll(1)
         last[torch.diff(flat.plan, prepend=flat.plan.new_full((1,), -1)) > 0] = size
+        last += stratum[block] * (size + 1)
         codes, cell = (last * size + flat.actions).unique(return_inverse=True)
         starts, row = last.unique(return_inverse=True)
         actions, single = flat.actions.unique(return_inverse=True)

@@ -4,7 +4,9 @@ Everything is tested by permuting what is independent (see `neuroprior.behaviour
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import combinations
 from math import lcm, nan
 
 import numpy as np
@@ -16,13 +18,12 @@ from neuroprior._checks import check_sizes
 from neuroprior._statistics import ENOUGH_UNITS, Difference, holm, ratio_difference
 from neuroprior.behaviour.analysis.condition_chains import SMOOTHING, ConditionChains
 from neuroprior.behaviour.analysis.flat import FlatPlans, ranks
+from neuroprior.behaviour.analysis.interaction import LEVEL, ConditionInteraction, compare_strata
 from neuroprior.behaviour.analysis.permutation_design import PermutationDesign
+from neuroprior.behaviour.analysis.permutation_tests import TIE, combine_tests, largest_statistics, shares_reaching
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.plans.columns import listed
 from neuroprior.plans.plans import check_are_plans
-
-LEVEL = 0.05
-"""P-values below this are significant."""
 
 FEWEST_PERMUTATIONS = 999
 """Permutations that are made whatever they cost."""
@@ -36,14 +37,8 @@ MOST_FEATURES = {"actions": 1000, "transitions": 1000, "sequences": 100, "durati
 LEAST_VARIANCE = 1e-6
 """Of all variance: the least that counts as that within conditions, as units may agree at random."""
 
-TIE = 1e-8
-"""Statistics that differ by less than this, or by less than this share, are tied: rounding depends on sums' order."""
-
 MAX_WORK = 5 * 10**8
 """Numbers that permutations may compute, some ten seconds on one core; beyond, fewer are made."""
-
-NUMBERS_AT_ONCE = 2**20
-"""Statistics that are in memory at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +54,7 @@ class ConditionFamily:
         means: float64 `[C, F]`: the mean over the units of each condition, with `low` and `high`, its 95 % interval.
         low, high: float64 `[C, F]`.
         difference: float64 `[3, F]`: the mean of the second of two conditions less that of the first, and the ends of
-            its 95 % interval; NaN for more than two conditions.
+            its 95 % interval; NaN for more than two conditions. With strata it is adjusted for them, by least squares.
         statistic: float64 `[F]`: between units Welch's t squared, or for more conditions Wald's standardised sum of
             squares; within units the F of repeated measures (for two conditions the paired t squared).
         p_values: float64 `[F]`: by permutation, of each feature alone.
@@ -123,6 +118,9 @@ class ConditionComparison:
         smallest_p: the smallest p-value that is possible.
         conclusive: whether there are enough units for a verdict.
         verdict: one sentence or two.
+        contrasts: of more than two conditions, the comparison of each two of them, with p-values that are corrected for
+            the number of pairs; in their order, those that cannot be tested left out.
+        interaction: whether the difference depends on the stratum; None without strata, or with too few units.
     """
 
     design: PermutationDesign
@@ -136,6 +134,8 @@ class ConditionComparison:
     smallest_p: float
     conclusive: bool
     verdict: str
+    contrasts: list["ConditionComparison"] = field(default_factory=list)
+    interaction: ConditionInteraction | None = None
 
     def differs(self, name: str) -> bool:
         """Whether the test of this name is significant, corrected; never where there are too few units."""
@@ -157,6 +157,12 @@ def compare_conditions(
     that units (blocks of a unit) under different conditions have the same distribution; statistics are studentised, so
     that for many units differences in mean matter alone (Janssen 1997).
 
+    With a `stratum`, such as the sex of each unit, conditions are permuted among the units of each stratum, and what a
+    stratum has in common is no difference between conditions; see `ConditionComparison.interaction` on differences
+    that depend on it. Of more than two conditions each two are compared as well, on their plans alone. Such a test of
+    a pair counts if that of all conditions does, too. Its p-value is corrected for the pairs (Holm), but not for the
+    three of three conditions: if one pair differs, only one other may not (closed testing, Marcus et al. 1976).
+
     Each feature is one number for each block. As rare ones are noisy, a block's number is smoothed in tests, as if
     `SMOOTHING` observations more were as in all units (in designs within units: in the whole unit), and weighted in
     means by n / (n + `SMOOTHING`) for n observations. Neither depends on the conditions, nor does the choice of
@@ -164,13 +170,13 @@ def compare_conditions(
     of 0 and unknown ones do not count.
 
     Args:
-        plans: with a `condition`. An end symbol is an action like others.
+        plans: with a `condition`, and perhaps a `stratum`. An end symbol is an action like others.
         permutations: at most so many random ones; fewer where they take more than `MAX_WORK`, but at least
             `FEWEST_PERMUTATIONS`.
         generator: draws them.
 
     Raises:
-        ValueError: the plans have no condition, or `permutations` is below 1.
+        ValueError: the plans have no condition, a group is in several strata, or `permutations` is below 1.
 
     Example:
         >>> first, second = torch.tensor([[0, 1] * 10]).repeat(8, 1), torch.tensor([[0, 0, 1, 1] * 5]).repeat(8, 1)
@@ -183,6 +189,24 @@ def compare_conditions(
     check_are_plans(plans)
     plans = RecordedPlans.of(plans)
     check_sizes(permutations=permutations)
+    found = _compare(plans, permutations, generator)
+    if len(found.condition_names) < 3 or found.prediction is None:
+        return found
+    assert plans.condition is not None
+    pairs = [
+        _compare(plans[torch.isin(plans.condition, torch.stack(pair))], permutations, generator, with_strata=False)
+        for pair in combinations(found.design.conditions.to(plans.actions.device), 2)
+    ]
+    contrasts = _correct_pairs(found, [pair for pair in pairs if pair.prediction is not None])
+    differing = [" and ".join(pair.condition_names) for pair in contrasts if pair.conclusive and pair.p_value < LEVEL]
+    said = f" Of two conditions, there differ {'; '.join(differing)} (corrected)." if differing else ""
+    return replace(found, contrasts=contrasts, verdict=found.verdict + said)
+
+
+def _compare(
+    plans: RecordedPlans, permutations: int, generator: torch.Generator | None, with_strata: bool = True
+) -> ConditionComparison:
+    """The comparison of all conditions, without contrasts; on request with the interaction of conditions and strata."""
     design = PermutationDesign.of(plans)
     names = [
         plans.condition_names[c] if plans.condition_names else f"condition {c}" for c in design.conditions.tolist()
@@ -190,12 +214,13 @@ def compare_conditions(
     if design.untestable:
         verdict = " ".join(f"{text}." for text in (f"Not tested: {design.untestable}", design.odd) if text)
         return ConditionComparison(design, names, [], None, {}, nan, 0, False, nan, False, verdict)
+    strata = [plans.stratum_names[s] if plans.stratum_names else f"stratum {s}" for s in design.strata.tolist()]
     kept = (design.block >= 0).to(plans.actions.device)
     plans, of_plan = plans[kept], design.block[design.block >= 0]
     flat = _on_cpu(FlatPlans.of(plans))
     block = of_plan[flat.plan]
     found = [_Numbers(*family, design) for family in _counted(plans, flat, block, len(design.label))]
-    chains = ConditionChains.of(flat, block, design.unit)
+    chains = ConditionChains.of(flat, block, design.unit, design.stratum)
     num = len(names)
     cost = num * (chains.cost + sum(numbers.smoothed.numel() for numbers in found) // 8)
     drawn = min(permutations, max(MAX_WORK // max(cost, 1), FEWEST_PERMUTATIONS))
@@ -207,16 +232,47 @@ def compare_conditions(
     prediction, statistics["bits"], statistics["classifier"] = _predicted(
         chains, design, labellings, block.bincount().double()
     )
-    p_values = [float(_shares_reaching(values)[0]) for values in statistics.values()]
-    tests = dict(zip(statistics, zip(p_values, holm(p_values).tolist(), strict=True), strict=True))
-    p_value = min(corrected for _, corrected in tests.values())
+    tests, p_value = combine_tests(statistics)
     smallest = design.smallest_p(drawn)
     conclusive = smallest < LEVEL and len(design.units) >= ENOUGH_UNITS
     verdict = _verdict(design, names, tests, p_value, smallest, conclusive) + f" {design.odd}." * bool(design.odd)
     exact = design.possible <= drawn + 1
+    interaction = None
+    if with_strata and len(strata) > 1:
+        smoothed = [(numbers.name, numbers.features, numbers.smoothed) for numbers in found]
+        interaction = compare_strata(design, strata, smoothed, drawn, generator)
     return ConditionComparison(
-        design, names, families, prediction, tests, p_value, labellings.shape[1], exact, smallest, conclusive, verdict
+        design,
+        names,
+        families,
+        prediction,
+        tests,
+        p_value,
+        labellings.shape[1],
+        exact,
+        smallest,
+        conclusive,
+        verdict,
+        interaction=interaction,
     )
+
+
+def _correct_pairs(whole: ConditionComparison, pairs: list[ConditionComparison]) -> list[ConditionComparison]:
+    """Comparisons of two conditions with p-values that are corrected for their number, and for the test of all."""
+
+    def correct(p_values: list[float], of_all: float) -> list[float]:
+        corrected = p_values if len(whole.condition_names) == 3 else holm(p_values).tolist()
+        return [max(p_value, of_all) for p_value in corrected]
+
+    every = correct([pair.p_value for pair in pairs], whole.p_value)
+    names = [name for name in whole.tests if all(name in pair.tests for pair in pairs)]
+    of_tests = {name: correct([pair.tests[name][0] for pair in pairs], whole.tests[name][1]) for name in names}
+    found = []
+    for place, (pair, p_value) in enumerate(zip(pairs, every, strict=True)):
+        tests = {name: (pair.tests[name][0], of_tests[name][place]) for name in names}
+        verdict = _verdict(pair.design, pair.condition_names, tests, p_value, pair.smallest_p, pair.conclusive)
+        found.append(replace(pair, tests=tests, p_value=p_value, verdict=verdict))
+    return found
 
 
 class _Numbers:
@@ -284,17 +340,9 @@ def _sums(
 
 def _tested(numbers: _Numbers, design: PermutationDesign, labellings: Tensor) -> tuple[ConditionFamily, Tensor]:
     """The family, and its largest statistic under each labelling `[P]`."""
-    size = max(NUMBERS_AT_ONCE // len(numbers.features), 1)
-    observed = _statistics(numbers.smoothed, design, labellings[:, :1])
-    greatest, reached = [], torch.zeros(len(observed), dtype=torch.double)
-    for part in labellings.split(size, 1):
-        statistics = _statistics(numbers.smoothed, design, part)
-        greatest.append(statistics.amax(0))
-        reached += (statistics >= _least(observed)).sum(1)
-    most = torch.cat(greatest)
-    above = len(most) - torch.searchsorted(most.sort().values, _least(observed[:, 0]))
+    compute = partial(_statistics, numbers.smoothed, design)
+    found = largest_statistics(compute, labellings, len(numbers.features))
     means, low, high, difference = _estimates(numbers, design)
-    corrected = above.double() / len(most)
     family = ConditionFamily(
         numbers.name,
         numbers.features,
@@ -303,17 +351,10 @@ def _tested(numbers: _Numbers, design: PermutationDesign, labellings: Tensor) ->
         low,
         high,
         difference,
-        observed[:, 0],
-        reached / len(most),
-        corrected,
-        float(corrected.min()),
+        *found[:3],
+        float(found.corrected.min()),
     )
-    return family, most
-
-
-def _least(statistic: Tensor) -> Tensor:
-    """What counts as at least this statistic."""
-    return statistic - TIE * (1 + statistic)
+    return family, found.largest
 
 
 def _statistics(values: Tensor, design: PermutationDesign, labellings: Tensor) -> Tensor:
@@ -323,7 +364,8 @@ def _statistics(values: Tensor, design: PermutationDesign, labellings: Tensor) -
         # What a unit has in common is no difference between conditions.
         whole = values.view(len(design.units), num, -1)
         values = (whole - whole.mean(1, keepdim=True)).view_as(values)
-    values = values - values.mean(0)
+    else:
+        values = values - _stratum_means(values, torch.ones_like(values), design)
     spread = values.square().mean(0).sqrt()
     alike = spread <= 1e-12 * values.abs().amax(0).clamp(min=1)
     values = (values / torch.where(alike, 1, spread)).masked_fill(alike, 0).T.contiguous()
@@ -359,11 +401,36 @@ def _estimates(numbers: _Numbers, design: PermutationDesign) -> tuple[Tensor, Te
             both = 1 / (1 / sizes - 1).sum(1).add(1)
             gap, gap_error, gap_freedom = _mean(pair[:, 1] - pair[:, 0], both)
         else:
-            gap, gap_error = mean[1] - mean[0], error.square().sum(0).sqrt()
-            gap_freedom = error.square().sum(0).square() / (error**4 / freedom).sum(0)  # Welch and Satterthwaite
+            gap, gap_error, gap_freedom = _stratified_gap(values, weights, design)
         gap_half = _half(gap_error, gap_freedom)
         difference = torch.stack([gap, gap - gap_half, gap + gap_half])
     return mean, mean - half, mean + half, difference
+
+
+def _stratified_gap(values: Tensor, weights: Tensor, design: PermutationDesign) -> tuple[Tensor, Tensor, Tensor]:
+    """The second of two conditions less the first, within strata; its standard error, and degrees of freedom.
+
+    By weighted least squares with robust errors (Welch and Satterthwaite); without strata the difference of means.
+    """
+    second = design.label.double()[:, None].expand_as(values)
+    second = second - _stratum_means(second, weights, design)
+    values = values - _stratum_means(values, weights, design)
+    scale = (weights * second.square()).sum(0)
+    gap = (weights * second * values).sum(0) / scale
+    part = (weights * second * (values - gap * second) / scale).square()
+    own = torch.stack([design.label == 0, design.label == 1]).double()
+    freedom = own @ (weights > 0).double() - (len(design.strata) + 1) / 2
+    variance = own @ part * (1 + (len(design.strata) + 1) / 2 / torch.where(freedom > 0, freedom, nan))
+    return gap, variance.sum(0).sqrt(), variance.sum(0).square() / (variance.square() / freedom).sum(0)
+
+
+def _stratum_means(values: Tensor, weights: Tensor, design: PermutationDesign) -> Tensor:
+    """`[B, F]`: the weighted mean of `values [B, F]` over the stratum of each block; 0 without weight."""
+    sums, total = torch.zeros(2, len(design.strata), values.shape[1], dtype=torch.double)
+    sums.index_add_(0, design.stratum, weights * values)
+    total.index_add_(0, design.stratum, weights)
+    means: Tensor = (sums / total).nan_to_num()[design.stratum]
+    return means
 
 
 def _mean(values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -404,15 +471,9 @@ def _predicted(
     saved = torch.zeros(units, dtype=torch.double).index_add_(0, design.unit, right[:, 0])
     sizes = torch.zeros(units, dtype=torch.double).index_add_(0, design.unit, actions)
     mean, low, high, _ = ratio_difference(saved, sizes)
-    gain = Difference(mean, low, high, float(_shares_reaching(bits)[0]))
-    p_value = float(_shares_reaching(order)[0])
+    gain = Difference(mean, low, high, float(shares_reaching(bits)[0]))
+    p_value = float(shares_reaching(order)[0])
     return ConditionPrediction(gain, float(share[0]), float(share.mean()), p_value, odds[:, :, 0].T), bits, order
-
-
-def _shares_reaching(statistics: Tensor) -> Tensor:
-    """`[P]`: for each labelling the share of all whose statistic is at least as large: its p-value."""
-    ordered, tie = statistics.sort().values, TIE * (statistics.abs() + 0.1)
-    return (len(ordered) - torch.searchsorted(ordered, statistics - tie)).double() / len(ordered)
 
 
 def _verdict(

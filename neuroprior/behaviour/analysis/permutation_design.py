@@ -2,7 +2,6 @@
 
 from collections import Counter
 from dataclasses import dataclass
-from itertools import permutations
 from math import factorial, prod
 from typing import Literal
 
@@ -18,69 +17,100 @@ Kind = Literal["between", "within"]
 DRAWN_AT_ONCE = 2**21
 """Labels that are drawn at a time."""
 
+MIN_UNITS = 2
+"""Units that a condition must have at least; of more than two conditions a rarer one is left out."""
+
 
 @dataclass(frozen=True, eq=False)
 class PermutationDesign:
-    """The G units of plans under C conditions, and how their conditions may be permuted.
+    """The G units of plans under C conditions in S strata, and how their conditions may be permuted.
 
     A unit is a group; a plan, where there are no groups. All plans of a unit under one condition are a block. Where
-    each unit is under one condition ("between"), permutations exchange the conditions of units. Where units are under
-    several ("within", a paired or repeated design), they exchange the conditions of the blocks of each unit; units that
-    are not under every condition are then left out. Plans of one unit under one condition are never separated.
+    each unit is under one condition ("between"), permutations exchange the conditions of units of the same stratum.
+    Where units are under several ("within", a paired or repeated design), they exchange the conditions of the blocks of
+    each unit. Plans of one unit under one condition are never separated.
+
+    Left out are conditions with fewer than `MIN_UNITS` units, where two conditions remain; then, within units, units
+    that are not under every condition, and between them, units of strata that are under one condition only.
 
     Attributes:
         kind: "between" or "within".
         item: what the units are, "groups" or "plans".
         conditions: int64 `[C]`: the numbers of the conditions, ascending.
+        strata: int64 `[S]`: the numbers of the strata, ascending; 0 alone without strata.
         units: int64 `[G]`: the numbers of the groups, or of the plans, ascending.
         left_out: int64: the numbers of the units that are left out.
-        block: int64 `[N]`: the block of each plan; -1 where its unit is left out, or it has no actions.
+        block: int64 `[N]`: the block of each plan; -1 where it is left out, or it has no actions.
         unit: int64 `[B]`, ascending: the rank of the unit of each block.
         label: int64 `[B]`: the rank of the condition of each block.
+        stratum: int64 `[B]`: the rank of the stratum of each block, the same for all blocks of a unit.
         untestable: why nothing can be tested; empty where it can.
         odd: which units are under several conditions, where most are under one, and what to do; else empty.
+        notes: what was left out, a sentence each.
     """
 
     kind: Kind
     item: str
     conditions: Tensor
+    strata: Tensor
     units: Tensor
     left_out: Tensor
     block: Tensor
     unit: Tensor
     label: Tensor
+    stratum: Tensor
     untestable: str
     odd: str = ""
+    notes: tuple[str, ...] = ()
 
     @staticmethod
     def of(plans: RecordedPlans) -> "PermutationDesign":
-        """The design of `plans`.
+        """Return the design of `plans`.
 
         Raises:
-            ValueError: the plans have no condition.
+            ValueError: the plans have no condition, or a group is in several strata.
         """
         if plans.condition is None:
             raise ValueError("condition: these plans have none; give them one, such as the treatment of each group")
-        some = plans.mask().any(1).cpu()
+        acted = plans.mask().any(1).cpu()
         number = torch.arange(len(plans)) if plans.group is None else plans.group.cpu().long()
-        conditions, label = plans.condition.cpu().long()[some].unique(return_inverse=True)
-        numbers, unit = number[some].unique(return_inverse=True)
+        conditions, label = plans.condition.cpu().long()[acted].unique(return_inverse=True)
+        numbers, unit = number[acted].unique(return_inverse=True)
+        strata, stratum = _strata(plans)[acted].unique(return_inverse=True)
+        of_unit = torch.zeros_like(numbers)
+        of_unit[unit] = stratum
+        if (of_unit[unit] != stratum).any():
+            raise ValueError("`stratum` must be the same for all plans of a group, got several for one group")
         under = torch.zeros(len(numbers), len(conditions), dtype=torch.bool)
         under[unit, label] = True
+        item, notes = "plans" if plans.group is None else "groups", []
+        names = [plans.condition_names[c] if plans.condition_names else f"condition {c}" for c in conditions.tolist()]
+
+        rare = under.sum(0) < MIN_UNITS
+        if rare.any() and (~rare).sum() > 1:
+            left = [name for name, is_rare in zip(names, rare.tolist(), strict=True) if is_rare]
+            notes.append(f"Left out, with fewer than {MIN_UNITS} {item}: {listed(left)}.")
+            under, conditions = under[:, ~rare], conditions[~rare]
+            names = [name for name in names if name not in left]
+            label = torch.where(rare[label], -1, (~rare).cumsum(0)[label] - 1)
         kind: Kind = "within" if bool((under.sum(1) > 1).any()) else "between"
-        kept = under.all(1) if kind == "within" else torch.ones(len(numbers), dtype=torch.bool)
-        of_block, rank = under[kept].nonzero(), torch.full(under.shape, -1)
-        rank[kept] = (under[kept].flatten().cumsum(0) - 1).view(-1, len(conditions)) if len(of_block) else -1
-        block = torch.full((len(plans),), -1)
-        block[some] = rank[unit, label]
-        item = "plans" if plans.group is None else "groups"
-        left = numbers[~kept]
-        names = plans.condition_names
-        named = [names[c] if names else f"condition {c}" for c in conditions.tolist()]
-        reason = _reason(kind, item, under[kept], named)
         single = under.sum(1) == 1
+        if kind == "within":
+            kept = under.all(1)
+            if lost := int((~kept).sum()):
+                notes.append(f"{lost} {item} that are not under every condition were left out.")
+        else:
+            sizes = torch.zeros(len(strata), len(conditions), dtype=torch.long).index_add_(0, of_unit, under.long())
+            kept = under.any(1) & ((sizes > 0).sum(1) > min(len(strata) - 1, 1))[of_unit]
+            if lost := int((under.any(1) & ~kept).sum()):
+                notes.append(f"{lost} {item} of strata that are under one condition only were left out.")
+
+        of_block, rank = under[kept].nonzero(), torch.full(under.shape, -1)
+        rank[kept] = torch.where(under[kept], (under[kept].flatten().cumsum(0) - 1).view(-1, len(conditions)), -1)
+        block = torch.full((len(plans),), -1)
+        block[acted] = torch.where(label >= 0, rank[unit, label], -1)
         odd = ""
-        if kind == "within" and single.sum() > (~single).sum() and not _reason("between", item, under[single], named):
+        if kind == "within" and single.sum() > (~single).sum() and not _reason("between", item, under[single], names):
             several = numbers[~single].tolist()
             groups = item == "groups" and plans.group_names
             odd = (
@@ -88,8 +118,21 @@ class PermutationDesign:
                 f" {int(single.sum())} {item} are under one each. If that is a slip, mend the condition of their plans;"
                 f" if not, leave these {item} out, and the others are compared with one another"
             )
+        remaining, stratum = of_unit[kept].unique(return_inverse=True)
         return PermutationDesign(
-            kind, item, conditions, numbers[kept], left, block, of_block[:, 0], of_block[:, 1], reason, odd
+            kind,
+            item,
+            conditions,
+            strata[remaining],
+            numbers[kept],
+            numbers[~kept],
+            block,
+            of_block[:, 0],
+            of_block[:, 1],
+            stratum[of_block[:, 0]],
+            _reason(kind, item, under[kept], names),
+            odd,
+            tuple(notes),
         )
 
     @property
@@ -98,18 +141,26 @@ class PermutationDesign:
         return self.label.bincount(minlength=len(self.conditions)).tolist()
 
     @property
+    def cell(self) -> Tensor:
+        """`[B]`: the cell of each block: its unit, or between units its stratum. Blocks of a cell exchange labels."""
+        return self.unit if self.kind == "within" else self.stratum
+
+    @property
+    def cell_sizes(self) -> Tensor:
+        """`[cells, C]`: how many blocks of each cell are under each condition."""
+        num = len(self.conditions)
+        return (self.cell * num + self.label).bincount(minlength=(int(self.cell.max()) + 1) * num).view(-1, num)
+
+    @property
     def possible(self) -> int:
         """The number of labellings, of ways to give the blocks their conditions."""
-        if self.kind == "within":
-            every: int = factorial(len(self.conditions)) ** len(self.units)
-            return every
-        same: int = prod(map(factorial, self.sizes))
-        return factorial(len(self.label)) // same
+        ways: int = prod(factorial(sum(own)) // prod(map(factorial, own)) for own in self.cell_sizes.tolist())
+        return ways
 
     @property
     def equivalent(self) -> int:
         """How many labellings are one and the same division, with conditions renamed; their statistics are equal."""
-        return prod(map(factorial, Counter(self.sizes).values()))
+        return prod(map(factorial, Counter(map(tuple, self.cell_sizes.T.tolist())).values()))
 
     def smallest_p(self, drawn: int) -> float:
         """The smallest p-value that a test with at most `drawn` random permutations can give."""
@@ -129,28 +180,31 @@ class PermutationDesign:
         return found.T.contiguous()
 
     def _random(self, number: int, generator: torch.Generator) -> Tensor:
-        if self.kind == "within":
-            return torch.rand(number, *self._shape, generator=generator).argsort(-1).flatten(1).short()
-        return self.label.short()[torch.rand(number, len(self.label), generator=generator).argsort(1)]
+        return self.label.short()[shuffle_within(self.cell, number, generator)]
 
     def _every(self) -> Tensor:
-        num = len(self.conditions)
-        if self.kind == "within":
-            orders = torch.tensor(list(permutations(range(num))))
-            place = len(orders) ** torch.arange(len(self.units))
-            which = torch.arange(self.possible)[:, None].div(place, rounding_mode="floor") % len(orders)
-            return orders[which].flatten(1).short()
-        found, left = torch.zeros(1, 0, dtype=torch.int16), torch.tensor([self.sizes])
-        for _ in self.label:  # each step gives one unit more each of the conditions that are left over
+        sizes, order = self.cell_sizes, self.cell.argsort(stable=True)
+        found, left, last = torch.zeros(1, 0, dtype=torch.int16), sizes[:1], 0
+        for cell in self.cell[order].tolist():  # each step gives one block more each of the conditions that are left
+            if cell != last:
+                left, last = sizes[cell].expand(len(found), -1), cell
             row, label = (left > 0).nonzero().unbind(1)
             found = torch.cat([found[row], label[:, None].short()], 1)
-            left = left[row] - torch.nn.functional.one_hot(label, num)
+            left = left[row] - torch.nn.functional.one_hot(label, sizes.shape[1])
+        found = found[:, order.argsort()]
         observed = int((found == self.label).all(1).nonzero()[0, 0])
         return found.roll(-observed, 0)
 
-    @property
-    def _shape(self) -> tuple[int, int]:
-        return len(self.units), len(self.conditions)
+
+def shuffle_within(cell: Tensor, number: int, generator: torch.Generator) -> Tensor:
+    """Return random orders `[number, B]`, int64, that move nothing out of its `cell [B]`, integers from 0."""
+    shuffled = (torch.rand(number, len(cell), generator=generator).double() + cell).argsort(1)
+    return shuffled[:, cell.argsort(stable=True).argsort()]
+
+
+def _strata(plans: RecordedPlans) -> Tensor:
+    """The stratum of each plan `[N]`, 0 where there are none."""
+    return torch.zeros(len(plans), dtype=torch.long) if plans.stratum is None else plans.stratum.cpu().long()
 
 
 def _reason(kind: Kind, item: str, under: Tensor, names: list[str]) -> str:
@@ -160,5 +214,7 @@ def _reason(kind: Kind, item: str, under: Tensor, names: list[str]) -> str:
     if kind == "within":
         number = "none" if not len(under) else "only one"
         return "" if len(under) > 1 else f"of the {item}, {number} is under every condition; at least two are needed"
-    few = [name for name, units in zip(names, under.sum(0).tolist(), strict=True) if units < 2]
+    if not len(under):
+        return "in each stratum all plans are under one condition"
+    few = [name for name, units in zip(names, under.sum(0).tolist(), strict=True) if units < MIN_UNITS]
     return f"{few[0]} has one of the {item} only; at least two are needed for each condition" if few else ""

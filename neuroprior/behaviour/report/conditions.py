@@ -12,6 +12,7 @@ from neuroprior.behaviour.analysis.conditions import (
     ConditionPrediction,
     compare_conditions,
 )
+from neuroprior.behaviour.analysis.interaction import LEVEL, ConditionInteraction
 from neuroprior.behaviour.report import figures
 from neuroprior.behaviour.report.document import Column, table
 from neuroprior.behaviour.report.findings import Finding, p_words
@@ -56,10 +57,22 @@ def condition_section(found: Evaluation) -> Part | None:
         _feature_table(result, features),
         _block_table(result, result.prediction, blocks),
     ]
+    if result.contrasts:
+        frames["condition_pairs"] = _pairs(result, actions)
+        tables.append(_pair_table(result, frames["condition_pairs"]))
+    if result.interaction is not None:
+        frames["condition_interaction"] = _interaction(result.interaction, actions)
+        tables.append(_interaction_table(result.interaction, frames["condition_interaction"]))
     box = _figure_box(result, features, units)
     unit = found.recordings.unit if found.recordings is not None else ""
     findings = [*_feature_findings(result, features, unit), *_prediction_findings(result, result.prediction)]
-    return Part(Section("Conditions", _text(result), tables, [box]), frames, [result.verdict], findings)
+    verdicts = [result.verdict]
+    if result.contrasts:
+        findings += _pair_findings(frames["condition_pairs"])
+    if result.interaction is not None:
+        findings += _interaction_findings(result.interaction, frames["condition_interaction"])
+        verdicts.append(result.interaction.verdict)
+    return Part(Section("Conditions", _text(result), tables, [box]), frames, verdicts, findings)
 
 
 SENTENCES = {
@@ -96,6 +109,47 @@ def _feature_findings(result: ConditionComparison, features: pd.DataFrame, unit:
     return found
 
 
+def _pair_findings(pairs: pd.DataFrame) -> list[Finding]:
+    """A finding for each feature of each two conditions."""
+    found = []
+    for row in pairs.to_dict("records"):
+        pair = f"{row['second']} against {row['first']}"
+        of_time = row["family"] == "durations"
+        by = f"{row['difference']:.3g} times" if of_time else f"difference {row['difference']:+.3g}"
+        p_corrected = max(row["corrected"], row["family_p"], row["all_p"])
+        sentence = (
+            f"{pair[0].upper()}{pair[1:]}, {row['feature']}: {by}, 95 % interval {row['low']:.3g} to {row['high']:.3g};"
+            f" {p_words(p_corrected)}."
+        )
+        name, family = f"{row['feature']}, {pair}", f"{row['family']}, {pair}"
+        estimate = (row["difference"], row["low"], row["high"], float(row["p_value"]))
+        starred = bool(row["significant"])
+        found.append(Finding(f"{row['family']}: {name}", family, name, *estimate, p_corrected, starred, sentence))
+    return found
+
+
+def _interaction_findings(result: ConditionInteraction, frame: pd.DataFrame) -> list[Finding]:
+    """A finding for each feature whose difference between conditions may depend on the stratum."""
+    found = []
+    for row in frame.to_dict("records"):
+        of_time = row["family"] == "durations"
+        differences = listed(
+            [
+                f"{row[f'difference, {name}']:{'' if of_time else '+'}.3g}{' times' * of_time} in {name}"
+                for name in result.stratum_names
+            ]
+        )
+        p_corrected = max(row["corrected"], result.tests[row["family"]][1])
+        name = f"{row['feature']}, by stratum"
+        sentence = f"The difference in {row['feature']} depends on the stratum ({differences}; {p_words(p_corrected)})."
+        family, p = f"{row['family']}, by stratum", float(row["p_value"])
+        starred = bool(row["significant"])
+        found.append(
+            Finding(f"{row['family']}: {name}", family, name, None, None, None, p, p_corrected, starred, sentence)
+        )
+    return found
+
+
 def _prediction_findings(result: ConditionComparison, prediction: ConditionPrediction) -> list[Finding]:
     """What knowing the condition saves, and how often the condition is told from the sequences."""
     mean, low, high, _ = prediction.gain
@@ -121,12 +175,13 @@ def _text(result: ConditionComparison) -> list[str]:
         if design.kind == "between"
         else f"Each of the {item} is under every condition: conditions were permuted within {item}."
     )
-    left = len(design.left_out)
+    if len(design.strata) > 1 and design.kind == "between":
+        how += f" They were permuted within {len(design.strata)} strata, whose differences do not count."
     return [
         result.verdict,
         f"{how} Plans of one unit under one condition always stay together, so that it does not matter how alike they"
         f" are. {'All' if result.exact else 'Random'} labellings that were compared, with the observed one:"
-        f" {result.labellings:,}." + f" {left} {item} that are not under every condition were left out." * (left > 0),
+        f" {' '.join([f'{result.labellings:,}.', *design.notes])}",
         "Families of features are tested by their most different feature (Westfall and Young); the tests are corrected"
         " for their number (Holm). Behaviour differs where one of them is significant. A star marks a feature that is"
         " significant, corrected for its family, in a family that is. Rates of rare features are smoothed towards those"
@@ -213,6 +268,65 @@ def _feature_table(result: ConditionComparison, features: pd.DataFrame) -> Table
         " ratios. p: corrected for the family; intervals are not."
     )
     return table(shown, columns, caption, "What differs")
+
+
+def _pairs(result: ConditionComparison, actions: list[str]) -> pd.DataFrame:
+    """The features of each two conditions, as of `_features`, with both in the columns `first` and `second`."""
+    parts = []
+    for pair in result.contrasts:
+        first, second = pair.condition_names
+        part = _features(pair, actions).rename(
+            columns={f"mean, {first}": "mean_first", f"mean, {second}": "mean_second"}
+        )
+        tested = part["family"].map({name: corrected for name, (_, corrected) in pair.tests.items()})
+        parts.append(part.assign(first=first, second=second, family_p=tested, all_p=pair.p_value))
+    columns = ["first", "second", "family", "feature", "mean_first", "mean_second", "difference", "low", "high"]
+    return pd.concat(parts)[[*columns, "p_value", "corrected", "family_p", "all_p", "significant"]]
+
+
+def _pair_table(result: ConditionComparison, pairs: pd.DataFrame) -> Table:
+    """For each two conditions the features that differ most."""
+    columns: dict[str, Column] = {
+        "conditions": lambda row: f"{row['second']}\nagainst {row['first']}",
+        "feature": "feature",
+        "difference": lambda row: f"{row.difference:{_sign(row)}.3g}" + " times" * (not _sign(row)),
+        "95 % interval": lambda row: f"{row.low:{_sign(row)}.3g} to {row.high:{_sign(row)}.3g}",
+        "p, family": lambda row: p_text(row.family_p),
+        "p": lambda row: p_text(row.corrected) + "*" * row.significant,
+    }
+    number = max(LISTED // len(result.contrasts), 1)
+    shown = pairs.groupby(["first", "second"], sort=False).head(number)
+    caption = (
+        f"The {number} features of each two conditions that differ most. p, family: of its family, corrected for the"
+        " pairs and for the test of all conditions. p: corrected for the family. *: both, and that of all families, are"
+        " below 0.05."
+    )
+    return table(shown, columns, caption, "Each two conditions")
+
+
+def _interaction(found: ConditionInteraction, actions: list[str]) -> pd.DataFrame:
+    """A row a feature, with the difference between two conditions in each stratum."""
+    parts = []
+    for family in found.families:
+        joint = " → " if family.name == "transitions" else " "
+        spelled = [joint.join(actions[action] for action in own) for own in family.features.tolist()]
+        part = pd.DataFrame({"family": family.name, "feature": [FAMILIES[family.name].format(own) for own in spelled]})
+        differences = family.differences.exp() if family.name == "durations" else family.differences
+        for name, own in zip(found.stratum_names, differences, strict=True):
+            part[f"difference, {name}"] = own.numpy()
+        part["p_value"], part["corrected"] = family.p_values.numpy(), family.corrected.numpy()
+        differs = found.tests[family.name][1] < LEVEL
+        parts.append(part.assign(significant=(part["corrected"] < LEVEL) & differs))
+    return pd.concat(parts, ignore_index=True).sort_values(["corrected", "p_value"], kind="stable", ignore_index=True)
+
+
+def _interaction_table(found: ConditionInteraction, frame: pd.DataFrame) -> Table:
+    columns: dict[str, Column] = {"feature": "feature"}
+    for name in found.stratum_names:
+        columns[f"difference,\n{name}"] = _cell_of(f"difference, {name}", ".3g")
+    columns["p"] = lambda row: p_text(row.corrected) + "*" * row.significant
+    caption = f"{found.verdict} Durations are ratios. p: corrected for the family; *: significant."
+    return table(frame[:LISTED], columns, caption, "Do differences depend on the stratum?")
 
 
 def _cell_of(name: str, form: str) -> Column:

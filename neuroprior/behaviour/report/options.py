@@ -40,8 +40,10 @@ class ReadOptions(Options):
         columns, missing, missing_words, unpaired, overlaps, ends: see `neuroprior.behaviour.Options`.
         day_first, words, merge_repeats, from_, to, drop, rename: see there.
         max_gap: a longer pause between two behaviours ends a plan, too; in the unit of the times.
-        compare: the factor that is compared, such as the treatment, where recordings have several.
+        compare: the factor that is compared, such as the treatment; the first where none is named.
         reference: its level that the others are compared with, such as vehicle.
+        strata: factors, such as sex, within whose levels it is compared; by default the others, but for those that vary
+            within a subject. None after the option: not within any.
         num_actions: number of actions, where they are numbers and the file does not say.
         action_names: names of the actions in the order of their numbers, where the file does not say.
         unknown: what behaviours do that are none of the names: an error, or a gap, at which a plan ends.
@@ -54,6 +56,7 @@ class ReadOptions(Options):
     max_gap: float | None = None
     compare: str | None = None
     reference: str | None = None
+    strata: Sequence[str] | None = None
     num_actions: int | None = None
     action_names: Sequence[str] | None = None
     unknown: Literal["error", "gap"] = "error"
@@ -83,8 +86,9 @@ class ReadOptions(Options):
         """Returns the plans of recordings, as `Recordings.plans` with these options."""
         plans = recordings.plans(
             max_gap=self.max_gap,
-            condition=self.compare,
+            compare=self.compare,
             reference=self.reference,
+            strata=self.strata,
             num_actions=self.num_actions,
             action_names=self.action_names,
             unknown=self.unknown,

@@ -127,14 +127,17 @@ def test_three_conditions_within_units_are_compared_by_the_f_of_repeated_measure
 def refitted(plans: Plans) -> dict[tuple[int, int], list[float]]:
     """For each group and condition its log2-likelihood without condition, then under each, fitted by hand."""
     counts, size, s = pairs_of(plans), plans.num_actions, SMOOTHING
+    strata = torch.zeros(len(plans)) if plans.stratum is None else plans.stratum
+    stratum = dict(zip(plans.group.tolist(), strata.tolist(), strict=True))
     labels = sorted({key[1] for key in counts})
     found: dict[tuple[int, int], list[float]] = {}
     for group, label in {key[:2] for key in counts}:
         learned = {key: n for key, n in counts.items() if key[0] != group}
 
-        def number(learned=learned, **wanted: int) -> float:
+        def number(learned=learned, group=group, **wanted: int) -> float:
             names = ("group", "label", "a", "b")
-            return sum(n for key, n in learned.items() if all(key[names.index(w)] == v for w, v in wanted.items()))
+            own = {key: n for key, n in learned.items() if "a" not in wanted or stratum[key[0]] == stratum[group]}
+            return sum(n for key, n in own.items() if all(key[names.index(w)] == v for w, v in wanted.items()))
 
         sums = [0.0] * (1 + len(labels))
         for (g, k, a, b), n in counts.items():
@@ -153,9 +156,13 @@ def refitted(plans: Plans) -> dict[tuple[int, int], list[float]]:
     [[[0], [1, 1], [0, 0], [1], [1]], [[0, 1], [1, 1, 0], [0, 1]], [[0, 1, 2], [2, 1, 0, 0], [1, 2, 0]]],
     ids=["between", "within", "three within"],
 )
-def test_the_prediction_is_that_of_chains_refitted_without_the_unit(conditions):
-    plans = study(9, conditions, length=12, num_actions=3)
+@pytest.mark.parametrize("with_strata", [False, True])
+def test_the_prediction_is_that_of_chains_refitted_without_the_unit(conditions, with_strata):
+    conditions = conditions * (1 + with_strata)
+    plans = study(9 + with_strata, conditions, length=12, num_actions=3)
     plans = replace(plans, lengths=torch.randint(4, 13, (len(plans),), generator=seeded(0)))
+    if with_strata:
+        plans = replace(plans, stratum=plans.group // (len(conditions) // 2))
     by_hand = refitted(plans)
     blocks, actions = sorted(by_hand), int(plans.lengths.sum())
     found = compare_conditions(plans).prediction
@@ -404,7 +411,7 @@ def test_parts_that_fit_the_memory_change_nothing(conditions, monkeypatch):
     plans = study(3, conditions, num_actions=3)
     whole = compare_conditions(plans, 63, seeded(0))
     design = PermutationDesign.of(plans)
-    monkeypatch.setattr("neuroprior.behaviour.analysis.conditions.NUMBERS_AT_ONCE", 60)
+    monkeypatch.setattr("neuroprior.behaviour.analysis.permutation_tests.NUMBERS_AT_ONCE", 60)
     monkeypatch.setattr("neuroprior.behaviour.analysis.condition_chains.CELLS_AT_ONCE", 1000)
     parts = compare_conditions(plans, 63, seeded(0))
     assert parts.tests == whole.tests

@@ -182,3 +182,52 @@ def test_units_that_cannot_be_compared_are_counted():
     text = " ".join(section_of(plans[~lost])[0].text)
     assert "1 groups that are not under every condition were left out" in text
     assert "left out" not in " ".join(section_of(plans)[0].text)
+
+
+def test_each_two_of_three_conditions_have_a_table():
+    plans = changed(between(18, 2, 3))
+    section, frames = section_of(plans)
+    found = compare_conditions(plans, generator=seeded(0))
+    pairs = frames["condition_pairs"]
+    numbers = [sum(len(family.features) for family in pair.families) for pair in found.contrasts]
+    assert pairs.groupby(["first", "second"], sort=False).size().tolist() == numbers
+    by_name = {tuple(pair.condition_names): pair for pair in found.contrasts}
+    for (first, second), own in pairs.groupby(["first", "second"]):
+        pair = by_name[first, second]
+        assert (own["all_p"] == pair.p_value).all()
+        row = own.set_index("feature").loc["duration of eat"]
+        family = next(family for family in pair.families if family.name == "durations")
+        assert row["family_p"] == pair.tests["durations"][1]
+        assert [row["difference"], row["low"], row["high"]] == pytest.approx(family.difference[:, 0].exp().tolist())
+        assert row["significant"] == ("drug 1" in (first, second))
+    shown = next(table for table in section.tables if table.title == "Each two conditions")
+    assert [row[0] for row in shown.rows[:: len(shown.rows) // 3]] == [
+        *("drug 1\nagainst drug 0", "drug 2\nagainst drug 0", "drug 2\nagainst drug 1"),
+    ]
+    assert "condition_pairs" not in section_of(changed(between(12)))[1]
+
+
+@pytest.mark.parametrize("conditions", [[[n // 2 % 2] * 4 for n in range(16)], within(12)], ids=["between", "within"])
+def test_strata_have_a_sentence_and_their_interaction_a_table(conditions):
+    plans = changed(conditions)
+    plans = replace(plans, stratum=plans.group % 2, stratum_names=["female", "male"])
+    section, frames = section_of(plans)
+    found = compare_conditions(plans, generator=seeded(0)).interaction
+    frame = frames["condition_interaction"]
+    printed = section.tables[-1]
+    assert printed.headings == ["feature", "difference,\nfemale", "difference,\nmale", "p"]
+    assert printed.caption.startswith(found.verdict)
+    family = next(family for family in found.families if family.name == "durations")
+    row = frame.set_index("feature").loc["duration of eat"]
+    assert [row["difference, female"], row["difference, male"]] == pytest.approx(
+        family.differences[:, 0].exp().tolist()
+    )
+    assert row["corrected"] == family.corrected[0]
+    assert frame["corrected"].is_monotonic_increasing
+    permuted = "permuted within 2 strata" in " ".join(section.text)
+    assert permuted == (compare_conditions(plans, 9).design.kind == "between")
+
+
+def test_a_rare_condition_is_noted():
+    text = " ".join(section_of(changed([*between(12), [2]]))[0].text)
+    assert "Left out, with fewer than 2 groups: drug 2." in text
