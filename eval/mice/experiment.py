@@ -125,7 +125,7 @@ def _pairs() -> Iterator[tuple[str, PriorName, PriorName]]:
 
 
 def simulate(
-    settings: MiceSettings, world: TabularWorld, mice_plans: Plans, finished: Callable[[str], None]
+    settings: MiceSettings, world: TabularWorld, mice_plans: Plans, finished: Callable[[str], object]
 ) -> tuple[pd.DataFrame, dict[PriorName, Prior], pd.DataFrame]:
     """Learn all priors and let a planner draw from each, `settings.seeds` times.
 

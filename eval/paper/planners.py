@@ -26,7 +26,7 @@ from neuroprior.worlds import GridWorld
 ANY_PREFIX = " (any prefix)"
 """Added to the name of a planner that may end a plan after any of its actions."""
 
-Finished = Callable[[str], None]
+Finished = Callable[[str], object]
 """Is called with the name of each part of a simulation that is finished."""
 
 

@@ -110,7 +110,7 @@ class ConditionComparison:
         families: the features of each kind; none if nothing could be tested.
         prediction: of actions from conditions and back; None if nothing could be tested.
         tests: by name, the p-value of each family, "bits" and "classifier", and the same corrected for the number of
-            these tests (`neuroprior.behaviour.holm`).
+            these tests (Westfall and Young 1993, step-down minP).
         p_value: of all tests together: the smallest corrected one; NaN if nothing could be tested. So behaviour differs
             just where one of the tests is significant.
         labellings: how many ways of giving blocks their conditions were compared, with the one observed.

@@ -57,7 +57,7 @@ class ConditionInteraction:
     Attributes:
         stratum_names: S of them.
         families: the features of each kind.
-        tests: by name of the family, its p-value, and the same corrected for their number (Holm).
+        tests: by name of the family, its p-value, and the same corrected for their number (step-down minP).
         p_value: the smallest corrected one.
         verdict: one sentence.
     """

@@ -6,13 +6,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior._statistics import holm
-
 TIE = 1e-8
 """Statistics that differ by less than this, or by less than this share, are tied: rounding depends on sums' order."""
 
 NUMBERS_AT_ONCE = 2**20
 """Statistics that are in memory at a time."""
+
+ROUNDING = 1e-12
+"""P-values that differ by less are equal."""
 
 
 class LargestStatistics(NamedTuple):
@@ -53,14 +54,23 @@ def largest_statistics(
 
 
 def combine_tests(statistics: Mapping[str, Tensor]) -> tuple[dict[str, tuple[float, float]], float]:
-    """Return the p-value of each test with that corrected for their number (Holm), and the smallest corrected one.
+    """Return the p-value of each test with that corrected for their number, and the smallest corrected one.
+
+    They are corrected by the smallest p-value of all tests in each permutation, step by step (Westfall and Young 1993,
+    step-down minP): never less powerful than Holm's correction, since it knows how the tests depend on one another.
 
     Args:
         statistics: by name, `[P]` in the same permutations; large ones speak against the hypothesis.
     """
-    p_values = [float(shares_reaching(values)[0]) for values in statistics.values()]
-    corrected = holm(p_values).tolist()
-    return dict(zip(statistics, zip(p_values, corrected, strict=True), strict=True)), min(corrected)
+    ranked = torch.stack([shares_reaching(values) for values in statistics.values()])
+    p_values, order = ranked[:, 0], ranked[:, 0].argsort(stable=True)
+    # the smallest p-value of each test and those after it, in each permutation
+    smallest = ranked[order].flip(0).cummin(0).values.flip(0)
+    reached = (smallest <= p_values[order][:, None] + ROUNDING).double().mean(1).cummax(0).values
+    corrected = torch.empty_like(reached)
+    corrected[order] = reached
+    tests = dict(zip(statistics, zip(p_values.tolist(), corrected.tolist(), strict=True), strict=True))
+    return tests, float(reached[0])
 
 
 def shares_reaching(statistics: Tensor) -> Tensor:

@@ -165,7 +165,7 @@ def transitions(
     """
     check_sizes(permutations=permutations)
     if isinstance(plans, Recordings):
-        plans = plans.plans(condition=by)
+        plans = plans.plans(compare=by)
     elif by not in (None, "condition"):
         raise ValueError(f'`by` must be "condition" for plans, got {by!r}; recordings have factors by name.')
     flat, size = FlatPlans.of(plans), plans.num_actions

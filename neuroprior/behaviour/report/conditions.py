@@ -183,9 +183,9 @@ def _text(result: ConditionComparison) -> list[str]:
         f" are. {'All' if result.exact else 'Random'} labellings that were compared, with the observed one:"
         f" {' '.join([f'{result.labellings:,}.', *design.notes])}",
         "Families of features are tested by their most different feature (Westfall and Young); the tests are corrected"
-        " for their number (Holm). Behaviour differs where one of them is significant. A star marks a feature that is"
-        " significant, corrected for its family, in a family that is. Rates of rare features are smoothed towards those"
-        " of all.",
+        " for their number (step-down minP). Behaviour differs where one of them is significant. A star marks a feature"
+        " that is significant, corrected for its family, in a family that is. Rates of rare features are smoothed"
+        " towards those of all.",
     ]
 
 

@@ -15,7 +15,7 @@ MOST_SENTENCES = 8
 class Finding:
     """One feature that was tested.
 
-    A family of features is significant by its p-value, corrected for the families of one question (Holm); a feature is
+    A family of features is significant by its p-value, corrected for the families of one question; a feature is
     where its family is and its own p-value, corrected for the features of the family, is. `p_corrected`, the larger
     of the two, is below `LEVEL` just where both are.
 

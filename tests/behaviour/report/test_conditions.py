@@ -186,7 +186,7 @@ def test_units_that_cannot_be_compared_are_counted():
 
 def test_each_two_of_three_conditions_have_a_table():
     plans = changed(between(18, 2, 3))
-    section, frames = section_of(plans)
+    section, frames, *_ = section_of(plans)
     found = compare_conditions(plans, generator=seeded(0))
     pairs = frames["condition_pairs"]
     numbers = [sum(len(family.features) for family in pair.families) for pair in found.contrasts]
@@ -211,7 +211,7 @@ def test_each_two_of_three_conditions_have_a_table():
 def test_strata_have_a_sentence_and_their_interaction_a_table(conditions):
     plans = changed(conditions)
     plans = replace(plans, stratum=plans.group % 2, stratum_names=["female", "male"])
-    section, frames = section_of(plans)
+    section, frames, *_ = section_of(plans)
     found = compare_conditions(plans, generator=seeded(0)).interaction
     frame = frames["condition_interaction"]
     printed = section.tables[-1]
