@@ -223,7 +223,7 @@ def motif_section(found: Evaluation) -> Part | None:
         tables = [table(frame, _without_p(columns, few), caption)]
         alt = "Over-represented sequences: " + "; ".join(frame["sequence"][:5])
         boxes = [FigureBox(figures.motif_figure(frame), "Times as often as expected.", alt, "motifs")]
-    return Part(Section("Over-represented sequences", text, tables, boxes), {"motifs": frame})
+    return Part(Section("Over-represented sequences", text, tables, boxes, folded=True), {"motifs": frame})
 
 
 def drift_section(found: Evaluation) -> Part | None:
@@ -314,15 +314,15 @@ def _action_drift(plans: Plans) -> pd.DataFrame:
 SECTIONS: dict[str, Callable[[Evaluation], Part | None]] = {
     "file": file_section,
     "recordings": recording_section,
-    "scores": score_section,
     "conditions": condition_section,
-    "lags": lag_section,
     "transitions": transition_section,
     "durations": duration_section,
+    "lags": lag_section,
+    "scores": score_section,
     "individuals": individual_section,
     "drift": drift_section,
-    "motifs": motif_section,
     "modes": mode_section,
+    "motifs": motif_section,
 }
 """By name, in the order of the page."""
 
