@@ -82,7 +82,7 @@ ROOMS = {
     "neuroprior.agents": "Agents",
     "neuroprior": "The top level",
     "neuroprior.behaviour": "Recorded behaviour",
-    "neuroprior.behaviour.report": "Reports",
+    "neuroprior.behaviour.reporting": "Reports",
     "neuroprior.control": "Actions that are vectors",
     "neuroprior.puzzles": "Puzzles",
     "neuroprior.training": "Training",

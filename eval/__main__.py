@@ -11,7 +11,7 @@ with ending_at_interrupts():
 COMMANDS = {
     "paper": Command("eval.paper.command:paper", "the paper's two simulations"),
     "plans": Command(
-        "neuroprior.behaviour.report.command:plans", "a report on a file of plans (also: neuroprior report)"
+        "neuroprior.behaviour.reporting.command:plans", "a report on a file of plans (also: neuroprior report)"
     ),
     "mice": Command("eval.mice.command:mice", "whether priors learned from mice in a labyrinth help a planner"),
     "compare": Command("eval.compare.command:compare", "priors, or planners, compared in many worlds at equal budget"),

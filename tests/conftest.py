@@ -38,7 +38,7 @@ def _blank(figure: Figure, file: Any, *, format: str | None = None, **how: Any) 
 def undrawn() -> Iterator[Any]:
     """For a module of tests of whole commands: figures are made, and files hold empty ones.
 
-    To draw them takes longer than all else. `tests/behaviour/report/test_page.py` draws all of a report's, and
+    To draw them takes longer than all else. `tests/behaviour/reporting/test_page.py` draws all of a report's, and
     `tests/integration/test_wheel.py` and `test_docs.py` those of whole commands. Gives what draws them.
     """
     draws = Figure.savefig

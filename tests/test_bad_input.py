@@ -24,9 +24,9 @@ from neuroprior import (
 from neuroprior.__main__ import main
 from neuroprior.behaviour import read
 from neuroprior.behaviour.recorded_plans import RecordedPlans
-from neuroprior.behaviour.report import FitOptions, ReadOptions
-from neuroprior.behaviour.report.figures import ethogram_figure
-from neuroprior.behaviour.report.plan_report import report
+from neuroprior.behaviour.reporting import FitOptions, ReadOptions
+from neuroprior.behaviour.reporting.figures import ethogram_figure
+from neuroprior.behaviour.reporting.plan_report import report
 from neuroprior.control import ICEMPlanner, PlanarArm, control
 from neuroprior.planners import FrontierPlanner, expected_score
 from neuroprior.plans import folds

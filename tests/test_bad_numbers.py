@@ -28,7 +28,7 @@ from neuroprior.behaviour import (
     motifs,
     mutual_information,
 )
-from neuroprior.behaviour.report import FitOptions, report
+from neuroprior.behaviour.reporting import FitOptions, report
 from neuroprior.control import ICEMPlanner, MPPIPlanner, NoisePrior, ShootingPlanner, VectorGRU, VectorPlans
 from neuroprior.planners import execute, expected_score, value_iteration
 from neuroprior.plans import all_plans, folds, in_parts

@@ -3,7 +3,7 @@
 from distributed import LocalCluster
 
 from neuroprior import MarkovPrior, Plans, UniformPrior
-from neuroprior.behaviour.report import FitOptions, report
+from neuroprior.behaviour import FitOptions, report
 
 if __name__ == "__main__":
     plans = Plans(MarkovPrior(3, 1).sample(40, 20), 3)

@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from neuroprior.behaviour import read, simulated_study
-from neuroprior.behaviour.report import FitOptions, report
+from neuroprior.behaviour import FitOptions, read, report, simulated_study
 
 report(read(simulated_study(0)), fits=FitOptions(["counts"], processes=1), out="report")
 assert "<svg" in Path("report/report.html").read_text(encoding="utf-8")

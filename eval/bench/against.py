@@ -7,8 +7,8 @@ from typing import Any
 import pandas as pd
 
 from neuroprior._files import read_json
-from neuroprior.behaviour.report.document import table
-from neuroprior.behaviour.report.page import Table
+from neuroprior.behaviour.reporting.document import table
+from neuroprior.behaviour.reporting.page import Table
 
 KEYS = {
     "rows": ("job", "peer"),

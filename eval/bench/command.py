@@ -17,8 +17,8 @@ from eval.bench.jobs import JOBS, ON_DEVICES, against_peers, on_device
 from eval.bench.timing import Rows, import_times
 from neuroprior._files import versions, write_json
 from neuroprior._jobs import Progress
-from neuroprior.behaviour.report.document import Column, printed, table, write_figures, write_frames
-from neuroprior.behaviour.report.page import Table
+from neuroprior.behaviour.reporting.document import Column, printed, table, write_figures, write_frames
+from neuroprior.behaviour.reporting.page import Table
 
 LEFT = 0.5
 """Share of a ratio that should be left beside busy processes."""

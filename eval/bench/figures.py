@@ -5,7 +5,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from eval.bench.sizes import slope
-from neuroprior.behaviour.report.drawing import FEWER, MORE, at_edges, dot, names_down, panels
+from neuroprior.behaviour.reporting.drawing import FEWER, MORE, at_edges, dot, names_down, panels
 
 ACROSS = 4
 """Panels beside each other."""

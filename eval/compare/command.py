@@ -17,7 +17,7 @@ from eval.compare.results import Results
 from eval.compare.run import Settings, compare_run
 from eval.worlds.runs import PowerOfTwo, Seed, check_distinct, run_experiment, runs_of
 from eval.worlds.suite import TASKS, Context, WorldName, check_contexts
-from neuroprior.behaviour.report.document import Document
+from neuroprior.behaviour.reporting.document import Document
 
 KINDS = ("markov", "macro", *NEURAL, COMBINED)
 """Kinds of priors that can be fitted."""

@@ -11,8 +11,8 @@ from eval.compare.figures import View, score_panels
 from eval.compare.run import Settings, curriculum_run
 from eval.worlds import runs
 from eval.worlds.suite import TASKS, Context, WorldName, check_contexts
-from neuroprior.behaviour.report.document import Document
-from neuroprior.behaviour.report.page import FigureBox, Section, Table
+from neuroprior.behaviour.reporting.document import Document
+from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
 
 ROUNDS = 4
 """Rounds at most, where no lengths are given."""

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 
-from neuroprior.behaviour.report.drawing import (
+from neuroprior.behaviour.reporting.drawing import (
     FEWER,
     MORE,
     WIDTH,
@@ -29,7 +29,7 @@ from neuroprior.behaviour.report.drawing import (
     panels,
     short,
 )
-from neuroprior.behaviour.report.page import INK, clean
+from neuroprior.behaviour.reporting.page import INK, clean
 
 SMALL = (3.0, 3.0)
 """Size of a figure beside others, inches."""

@@ -16,8 +16,8 @@ from eval.compare.run import Contest, Contestant, Settings
 from eval.worlds import runs
 from eval.worlds.starts import Starts, worth
 from eval.worlds.suite import TASKS
-from neuroprior.behaviour.report.document import Document
-from neuroprior.behaviour.report.page import FigureBox, Section, Table
+from neuroprior.behaviour.reporting.document import Document
+from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
 from neuroprior.planners import FrontierPlanner, MCTSPlanner, Planner, SamplingPlanner, execute
 from neuroprior.planners.tuning import TEMPERATURES
 from neuroprior.worlds import World

@@ -11,9 +11,9 @@ from eval.compare import figures
 from eval.compare.figures import POINTS, Style
 from eval.compare.results import AGAINST, BEST, Results, grouped, kind_of
 from eval.worlds.runs import across_table, plus_minus, table_by
-from neuroprior.behaviour.report.document import Column, Document, table
-from neuroprior.behaviour.report.figures import transition_figure
-from neuroprior.behaviour.report.page import FigureBox, Section, Table
+from neuroprior.behaviour.reporting.document import Column, Document, table
+from neuroprior.behaviour.reporting.figures import transition_figure
+from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
 
 FRAMES = {name: name for name in ("rows", "paired", "efficiency", "bits", "words", "reasons", "across", "combined")}
 FRAMES |= {"growth": "curriculum"}

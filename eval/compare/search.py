@@ -17,8 +17,8 @@ from eval.worlds import runs
 from eval.worlds.suite import TASKS, WorldName
 from neuroprior import Plans, Prior
 from neuroprior._random import draw_seed
-from neuroprior.behaviour.report.document import Document
-from neuroprior.behaviour.report.page import Section
+from neuroprior.behaviour.reporting.document import Document
+from neuroprior.behaviour.reporting.page import Section
 from neuroprior.planners import search_weights
 from neuroprior.plans.folds import folds
 

@@ -28,7 +28,7 @@ from eval.control.run import (
 from eval.control.tasks import CONDITIONS, TaskName, check_there
 from eval.worlds import runs
 from neuroprior._jobs import JobRun
-from neuroprior.behaviour.report.document import publish, write_figures
+from neuroprior.behaviour.reporting.document import publish, write_figures
 from neuroprior.control import VectorPlans, read_vector_plans, write_vector_plans
 
 FEW = ("half_cheetah", "arm")

@@ -12,9 +12,9 @@ from eval.control.priors import NONE
 from eval.control.tasks import CONDITIONS, TASKS
 from eval.worlds import runs
 from neuroprior._statistics import ENOUGH_UNITS
-from neuroprior.behaviour.report.document import Column, Document, table
-from neuroprior.behaviour.report.drawing import WIDTH, at_edges, band, drawn, legend, panels
-from neuroprior.behaviour.report.page import FigureBox, Section, Table
+from neuroprior.behaviour.reporting.document import Column, Document, table
+from neuroprior.behaviour.reporting.drawing import WIDTH, at_edges, band, drawn, legend, panels
+from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
 
 PLACE = ["task", "condition", "planner", "prior", "budget"]
 

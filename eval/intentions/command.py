@@ -11,7 +11,7 @@ from eval.intentions.mice import BLOCKS, STRETCH
 from eval.intentions.report import intentions_document
 from eval.intentions.run import LABYRINTH, intentions_run
 from eval.worlds import runs
-from neuroprior.behaviour.report.document import write_figures
+from neuroprior.behaviour.reporting.document import write_figures
 
 OFFERED = (*WORLDS, LABYRINTH)
 """Two grids, and the mice's labyrinth."""

@@ -12,9 +12,9 @@ from eval.intentions.grid import FORECAST_AFTER, SWITCH_AT
 from eval.intentions.run import LABYRINTH
 from eval.worlds import runs
 from neuroprior._statistics import mean_interval
-from neuroprior.behaviour.report.document import Column, Document, table
-from neuroprior.behaviour.report.drawing import WIDTH, at_edges, band, drawn, legend, panels
-from neuroprior.behaviour.report.page import FigureBox, Section, Table
+from neuroprior.behaviour.reporting.document import Column, Document, table
+from neuroprior.behaviour.reporting.drawing import WIDTH, at_edges, band, drawn, legend, panels
+from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
 
 KINDS = {
     "uniform": "#7d838c",

@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from eval.live.run import FORESIGHT, ORACLE, PARTS, RANDOM
 from eval.worlds import runs
 from eval.worlds.aggregates import mean_intervals
-from neuroprior.behaviour.report.document import Column, Document, table
-from neuroprior.behaviour.report.drawing import WIDTH, at_edges, band, drawn, legend, panels
-from neuroprior.behaviour.report.page import FigureBox, Section, Table
+from neuroprior.behaviour.reporting.document import Column, Document, table
+from neuroprior.behaviour.reporting.drawing import WIDTH, at_edges, band, drawn, legend, panels
+from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
 
 CONDITION = ["prior", "context", "learns", "warm_start"]
 NAMES = {"prior": "prior", "context": "context", "learns": "learns"}

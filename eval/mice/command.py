@@ -25,8 +25,16 @@ from eval.worlds.runs import check_distinct, plus_minus, table_by
 from neuroprior import read_plans
 from neuroprior._files import write_json
 from neuroprior._jobs import Progress
-from neuroprior.behaviour.report.document import Column, Document, results_of, show, table, write_figures, write_frames
-from neuroprior.behaviour.report.page import Section, Table
+from neuroprior.behaviour.reporting.document import (
+    Column,
+    Document,
+    results_of,
+    show,
+    table,
+    write_figures,
+    write_frames,
+)
+from neuroprior.behaviour.reporting.page import Section, Table
 from neuroprior.worlds import labyrinth
 
 

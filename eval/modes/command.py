@@ -28,9 +28,9 @@ from eval.worlds.labyrinth import DATA, data_digest
 from neuroprior import read_plans
 from neuroprior._jobs import JobRun
 from neuroprior.behaviour.analysis.modes import STABLE, mode_table
-from neuroprior.behaviour.report.document import Column, Document, publish, table, write_figures
-from neuroprior.behaviour.report.page import FigureBox, Section, Table
-from neuroprior.behaviour.report.scores import load_arrays, save_arrays
+from neuroprior.behaviour.reporting.document import Column, Document, publish, table, write_figures
+from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
+from neuroprior.behaviour.reporting.scores import load_arrays, save_arrays
 
 
 def modes(

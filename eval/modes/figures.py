@@ -11,7 +11,7 @@ from torch import Tensor
 
 from eval.modes.experiment import WITHIN
 from eval.worlds.labyrinth_drawing import coordinates, corridors, signs
-from neuroprior.behaviour.report.drawing import STRIPS, WIDTH, band, drawn, legend, panels
+from neuroprior.behaviour.reporting.drawing import STRIPS, WIDTH, band, drawn, legend, panels
 from neuroprior.worlds import labyrinth
 
 TITLES = {

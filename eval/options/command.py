@@ -11,7 +11,7 @@ from eval.options.run import LABYRINTH, OptionSettings, options_run
 from eval.worlds import runs
 from eval.worlds.labyrinth import check_fits
 from eval.worlds.suite import TASKS
-from neuroprior.behaviour.report.document import write_figures
+from neuroprior.behaviour.reporting.document import write_figures
 
 WORLDS = (LABYRINTH, "four_rooms", "goal_maze")
 """Worlds that are planned in by default."""

@@ -9,9 +9,9 @@ from matplotlib.figure import Figure
 from eval.options.priors import pairs
 from eval.options.run import LABYRINTH
 from eval.worlds import runs
-from neuroprior.behaviour.report.document import Document
-from neuroprior.behaviour.report.drawing import WIDTH, at_edges, band, drawn, legend, panels
-from neuroprior.behaviour.report.page import FigureBox, Section, Table
+from neuroprior.behaviour.reporting.document import Document
+from neuroprior.behaviour.reporting.drawing import WIDTH, at_edges, band, drawn, legend, panels
+from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
 
 PLACE = ["world", "context", "length", "num_plans"]
 """What is the same for two priors that are compared, beside the seed."""

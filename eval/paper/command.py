@@ -15,7 +15,7 @@ from eval.paper.planners import ANY_PREFIX, PaperSettings, under_each
 from eval.paper.second_simulation import PAPER_REACHED, SCALES
 from neuroprior._files import versions, write_json
 from neuroprior._jobs import Progress
-from neuroprior.behaviour.report.document import Column, printed, records, table, write_figures, write_frames
+from neuroprior.behaviour.reporting.document import Column, printed, records, table, write_figures, write_frames
 
 SHORT = {"deterministic": "det.", "random": "rand.", "markov-1": "m-1", "markov-2": "m-2", "markov-3": "m-3"}
 SHORT |= {"transformer": "trans."}

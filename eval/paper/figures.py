@@ -10,7 +10,7 @@ from torch import Tensor
 from eval.paper.first_simulation import FirstResult
 from eval.paper.planners import ANY_PREFIX, PaperSettings
 from eval.paper.second_simulation import SecondResult
-from neuroprior.behaviour.report.drawing import band, panels
+from neuroprior.behaviour.reporting.drawing import band, panels
 from neuroprior.worlds import GridWorld
 from neuroprior.worlds.grid import MOVES
 

@@ -30,8 +30,8 @@ from eval.worlds.runs import check_distinct, command_line
 from neuroprior._files import write_whole
 from neuroprior._jobs import JobRun
 from neuroprior._statistics import paired_difference
-from neuroprior.behaviour.report.document import Document, publish, table
-from neuroprior.behaviour.report.page import Section, Table
+from neuroprior.behaviour.reporting.document import Document, publish, table
+from neuroprior.behaviour.reporting.page import Section, Table
 
 DATA = Path(__file__).parents[1] / "data"
 

@@ -21,8 +21,8 @@ from neuroprior._jobs import JobRun, Progress
 from neuroprior._random import draw_seed
 from neuroprior._statistics import paired_difference
 from neuroprior.behaviour.analysis.comparison import Score, score
-from neuroprior.behaviour.report.document import Column, Document, publish, table
-from neuroprior.behaviour.report.page import Section, Table
+from neuroprior.behaviour.reporting.document import Column, Document, publish, table
+from neuroprior.behaviour.reporting.page import Section, Table
 from neuroprior.priors.ensembles.candidates import best_chain
 
 LENGTH = 32

@@ -9,7 +9,7 @@ from jsonargparse.typing import PositiveInt
 from eval.sources.report import sources_document
 from eval.sources.run import SOURCES, WORLDS, SourceSettings, run_sources
 from eval.worlds import runs
-from neuroprior.behaviour.report.document import write_figures
+from neuroprior.behaviour.reporting.document import write_figures
 from neuroprior.comparison.trial import MIN_LEARNED
 
 SourceWorld: TypeAlias = Literal[tuple(WORLDS)]  # type: ignore[valid-type]

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from eval.sources.run import PARTS, SOURCES
 from eval.worlds import runs
-from neuroprior.behaviour.report.document import Column, Document, table
-from neuroprior.behaviour.report.page import FigureBox, Section, Table
+from neuroprior.behaviour.reporting.document import Column, Document, table
+from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
 
 PLACE = ["part", "world", "plans"]
 

@@ -14,8 +14,8 @@ from scipy import stats
 
 from neuroprior._jobs import JobRun
 from neuroprior.behaviour import Recordings, compare_conditions, share_interval, simulated_study
-from neuroprior.behaviour.report.document import Document, publish, table
-from neuroprior.behaviour.report.page import Section, Table
+from neuroprior.behaviour.reporting.document import Document, publish, table
+from neuroprior.behaviour.reporting.page import Section, Table
 from neuroprior.behaviour.study import LONGER, MOVED
 
 LEVEL = 0.05

@@ -20,8 +20,8 @@ from eval.worlds.aggregates import interquartile_gap, interquartile_mean, mean_i
 from neuroprior._files import read_json
 from neuroprior._jobs import JobRun
 from neuroprior._statistics import holm, paired_difference
-from neuroprior.behaviour.report.document import Column, Document, publish, table
-from neuroprior.behaviour.report.page import Table
+from neuroprior.behaviour.reporting.document import Column, Document, publish, table
+from neuroprior.behaviour.reporting.page import Table
 
 MAKERS = ("gymnasium", "minigrid", "mujoco")
 """Packages of which another version may make other worlds."""

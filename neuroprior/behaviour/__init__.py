@@ -1,7 +1,7 @@
 """Wing 1: recorded behaviour: recordings, durations, statistics of sequences, tests, the report.
 
-The report is in `neuroprior.behaviour.report`; intervals and tests in `neuroprior._statistics`. A room is imported when
-one of its names is first used: `read` and `Recordings` need no torch, which takes seconds.
+The report's figures are in `neuroprior.behaviour.reporting`; intervals and tests in `neuroprior._statistics`. A room is
+imported when one of its names is first used: `read` and `Recordings` need no torch, which takes seconds.
 """
 
 from importlib import import_module
@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from neuroprior.behaviour.reading import Columns, Options, ReadingError, read
     from neuroprior.behaviour.recorded_plans import RecordedPlans
     from neuroprior.behaviour.recordings import Recordings
+    from neuroprior.behaviour.reporting import FitOptions, ReadOptions, report
     from neuroprior.behaviour.study import large_study, simulated_study
 
 __all__ = [
@@ -70,6 +71,7 @@ __all__ = [
     "Difference",
     "DurationLaw",
     "DurationModel",
+    "FitOptions",
     "GroupDrift",
     "Individuals",
     "InteractionFamily",
@@ -84,6 +86,7 @@ __all__ = [
     "PermutationDesign",
     "PlanDrift",
     "PositionDrift",
+    "ReadOptions",
     "ReadingError",
     "RecordedPlans",
     "Recordings",
@@ -112,6 +115,7 @@ __all__ = [
     "paired_difference",
     "ratio_difference",
     "read",
+    "report",
     "score",
     "score_bits",
     "share_interval",
@@ -141,6 +145,7 @@ _ROOMS = (
     "neuroprior.behaviour.durations.semi_markov",
     "neuroprior.behaviour.recorded_plans",
     "neuroprior.behaviour.study",
+    "neuroprior.behaviour.reporting",
 )
 """Where the names above are: first those that need no torch."""
 

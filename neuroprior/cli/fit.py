@@ -19,9 +19,9 @@ from neuroprior._files import write_whole
 from neuroprior.behaviour.analysis.comparison import best_chain
 from neuroprior.behaviour.analysis.modes import choose_modes
 from neuroprior.behaviour.recorded_plans import RecordedPlans
-from neuroprior.behaviour.report.document import Column, printed, table, write_frames
-from neuroprior.behaviour.report.modes import choice_table
-from neuroprior.behaviour.report.options import ReadOptions
+from neuroprior.behaviour.reporting.document import Column, printed, table, write_frames
+from neuroprior.behaviour.reporting.modes import choice_table
+from neuroprior.behaviour.reporting.options import ReadOptions
 from neuroprior.cli.fit_data import Parts, divide
 from neuroprior.cli.fit_report import report
 from neuroprior.cli.program import make_parser

@@ -11,8 +11,8 @@ import torch
 
 from neuroprior._jobs import JobRun
 from neuroprior.behaviour.analysis.comparison import Score, action_bits, baselines, score_bits
-from neuroprior.behaviour.report.fits import ACTIONS, CONTEXT, Arrays
-from neuroprior.behaviour.report.scores import load_arrays, save_arrays
+from neuroprior.behaviour.reporting.fits import ACTIONS, CONTEXT, Arrays
+from neuroprior.behaviour.reporting.scores import load_arrays, save_arrays
 from neuroprior.cli.fit_data import Parts
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import divisible, fair_split, folds

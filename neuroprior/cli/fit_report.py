@@ -11,7 +11,7 @@ from rich.console import Console
 
 from neuroprior._files import versions, write_json
 from neuroprior.behaviour.analysis.comparison import Score, baselines, never_taken, score, too_few, unit_name
-from neuroprior.behaviour.report.document import printed, records, table, write_figures, write_frames
+from neuroprior.behaviour.reporting.document import printed, records, table, write_figures, write_frames
 from neuroprior.cli.fit_data import Parts
 from neuroprior.cli.fit_folds import TRAINED, cross_validated
 from neuroprior.priors import CombinedPrior, Prior, save

@@ -9,8 +9,8 @@ from rich.console import Console
 
 from neuroprior.behaviour.analysis.comparison import action_bits, score_bits, too_few, unit_name
 from neuroprior.behaviour.durations.past_durations import PastDurations
-from neuroprior.behaviour.report.document import printed, table, write_frames
-from neuroprior.behaviour.report.options import ReadOptions, is_recording, name_files
+from neuroprior.behaviour.reporting.document import printed, table, write_frames
+from neuroprior.behaviour.reporting.options import ReadOptions, is_recording, name_files
 from neuroprior.priors import load
 from neuroprior.priors.matching import learned_names, match_plans, numbered_note, taken_note, with_contexts_of
 from neuroprior.priors.scoring import learned_from, scores_by

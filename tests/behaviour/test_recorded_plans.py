@@ -9,7 +9,7 @@ import torch
 from neuroprior import Plans
 from neuroprior.behaviour import RecordedPlans
 from neuroprior.behaviour.recorded_plans import durations_of
-from neuroprior.behaviour.report import ReadOptions
+from neuroprior.behaviour.reporting import ReadOptions
 from neuroprior.plans import in_parts, read_plans, write_minari, write_plans
 from neuroprior.plans.sequences import plans_digest
 from tests.support.sources import refuses

@@ -7,7 +7,7 @@ import torch
 
 from neuroprior import ExhaustivePlanner, MarkovPrior, Plans, gridworld
 from neuroprior.behaviour import PastDurations, RecordedPlans
-from neuroprior.behaviour.report import ReadOptions
+from neuroprior.behaviour.reporting import ReadOptions
 from neuroprior.cli import fit as command
 from neuroprior.cli.fit_data import divide
 from tests.support.sources import refuses, seeded

@@ -7,7 +7,7 @@ from neuroprior import MarkovPrior, Plans, save
 from neuroprior.__main__ import main
 from neuroprior.behaviour import SemiMarkovPrior, read
 from neuroprior.behaviour.recorded_plans import RecordedPlans
-from neuroprior.behaviour.report import ReadOptions
+from neuroprior.behaviour.reporting import ReadOptions
 from neuroprior.plans import read_plans
 from tests.support.sources import seeded
 

@@ -13,8 +13,8 @@ from neuroprior import MarkovPrior, Plans, save
 from neuroprior.__main__ import main
 from neuroprior.behaviour import read
 from neuroprior.behaviour.recorded_plans import RecordedPlans
-from neuroprior.behaviour.report import ReadOptions
-from neuroprior.behaviour.report.plan_report import report
+from neuroprior.behaviour.reporting import ReadOptions
+from neuroprior.behaviour.reporting.plan_report import report
 from neuroprior.cli import score as command
 from neuroprior.plans import write_plans
 from neuroprior.priors.scoring import keep_learned

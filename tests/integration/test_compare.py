@@ -15,7 +15,7 @@ from eval.compare.command import KINDS, compare
 from eval.compare.results import Results
 from eval.worlds.suite import TASKS
 from neuroprior import GRUPrior, MarkovPrior, Plans, save
-from neuroprior.behaviour.report.document import Document
+from neuroprior.behaviour.reporting.document import Document
 from tests.support.made_up_runs import made_up
 from tests.support.reports import FROM_ELSEWHERE
 

@@ -11,7 +11,7 @@ import torch
 from neuroprior.__main__ import main
 from neuroprior.behaviour import PastDurations, SemiMarkovPrior
 from neuroprior.behaviour.recorded_plans import RecordedPlans
-from neuroprior.behaviour.report import ReadOptions
+from neuroprior.behaviour.reporting import ReadOptions
 from neuroprior.plans import write_plans
 from neuroprior.priors import GRUPrior, MarkovPrior, load, match_plans
 from tests.support.sources import seeded

@@ -9,7 +9,7 @@ import torch
 from neuroprior import Plans, load, write_plans
 from neuroprior.__main__ import main
 from neuroprior.behaviour.recorded_plans import RecordedPlans
-from neuroprior.behaviour.report import FitOptions, report
+from neuroprior.behaviour.reporting import FitOptions, report
 from neuroprior.priors import SwitchingPrior
 from tests.support.sources import seeded
 

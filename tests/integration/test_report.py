@@ -13,8 +13,8 @@ from eval.__main__ import main
 from neuroprior import ContextTreePrior, GRUPrior, MarkovPrior, Plans, Prior, UniformPrior, load, save
 from neuroprior.behaviour import read
 from neuroprior.behaviour.analysis.comparison import score
-from neuroprior.behaviour.report.document import records, results_of
-from neuroprior.behaviour.report.plan_report import report
+from neuroprior.behaviour.reporting.document import records, results_of
+from neuroprior.behaviour.reporting.plan_report import report
 from neuroprior.plans import read_plans, write_plans
 from tests.support.events import write_events
 from tests.support.sources import seeded

@@ -30,7 +30,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "neuroprior",
         next(n for n in names if "dist-info" in n).split("/")[0],
     }
-    for needed in ("cli/recipes/gru.yaml", "behaviour/report/page.html.j2", "py.typed"):
+    for needed in ("cli/recipes/gru.yaml", "behaviour/reporting/page.html.j2", "py.typed"):
         assert f"neuroprior/{needed}" in names
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder / "venv")], check=True)
     python = folder / "venv" / "bin" / "python"

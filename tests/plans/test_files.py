@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import Plans
-from neuroprior.behaviour.report import ReadOptions
+from neuroprior.behaviour.reporting import ReadOptions
 from neuroprior.plans import expand_context, read_plans, write_plans
 from neuroprior.plans.columns import is_missing, number_in
 

@@ -10,9 +10,9 @@ import pytest
 
 from eval.__main__ import main
 from neuroprior import Plans
-from neuroprior.behaviour.report.document import results_of
-from neuroprior.behaviour.report.options import FitOptions
-from neuroprior.behaviour.report.plan_report import report as report_on
+from neuroprior.behaviour.reporting.document import results_of
+from neuroprior.behaviour.reporting.options import FitOptions
+from neuroprior.behaviour.reporting.plan_report import report as report_on
 from neuroprior.plans import write_plans
 
 QUICK = FitOptions(models=["counts"], max_steps=3, processes=1)

@@ -16,8 +16,8 @@ from rich.console import Console
 from eval.compare import figures
 from eval.compare.report import FRAMES, document
 from eval.compare.results import Results
-from neuroprior.behaviour.report.document import publish, records
-from neuroprior.behaviour.report.drawing import FEWER, MORE
+from neuroprior.behaviour.reporting.document import publish, records
+from neuroprior.behaviour.reporting.drawing import FEWER, MORE
 from tests.support.browser import check_in_browser
 from tests.support.compare_runs import BUDGETS, TIMES, curve, drawing, entry, run, worlds
 from tests.support.reports import FROM_ELSEWHERE

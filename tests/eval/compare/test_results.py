@@ -12,7 +12,7 @@ from scipy import stats
 from eval.compare.results import AGAINST, BEST, Results, best_difference, chosen, needed
 from eval.worlds.aggregates import interquartile_gap, interquartile_mean, probability_of_improvement
 from neuroprior._statistics import holm, mean_interval, paired_difference
-from neuroprior.behaviour.report.document import records
+from neuroprior.behaviour.reporting.document import records
 from tests.support.compare_runs import BUDGETS, TIMES, curve, entry, run, worlds
 
 ASKED = (16, 256, 4096)

@@ -10,12 +10,12 @@ import torch
 from matplotlib.figure import Figure
 
 from neuroprior.behaviour import RecordedPlans
-from neuroprior.behaviour.report.document import Document
-from neuroprior.behaviour.report.options import FitOptions, ReadOptions
-from neuroprior.behaviour.report.page import FigureBox
-from neuroprior.behaviour.report.plan_report import report
-from neuroprior.behaviour.report.scores import evaluate_saved
-from neuroprior.behaviour.report.sections import (
+from neuroprior.behaviour.reporting.document import Document
+from neuroprior.behaviour.reporting.options import FitOptions, ReadOptions
+from neuroprior.behaviour.reporting.page import FigureBox
+from neuroprior.behaviour.reporting.plan_report import report
+from neuroprior.behaviour.reporting.scores import evaluate_saved
+from neuroprior.behaviour.reporting.sections import (
     SECTIONS,
     drift_section,
     lag_section,

@@ -10,8 +10,8 @@ import torch
 
 from neuroprior.behaviour import PastDurations, RecordedPlans
 from neuroprior.behaviour.analysis.comparison import action_bits, score_bits
-from neuroprior.behaviour.report.fits import ACTIONS, CONTEXT, DURATIONS, Design, Job
-from neuroprior.behaviour.report.scores import (
+from neuroprior.behaviour.reporting.fits import ACTIONS, CONTEXT, DURATIONS, Design, Job
+from neuroprior.behaviour.reporting.scores import (
     Evaluation,
     Model,
     evaluate,

@@ -13,12 +13,12 @@ from neuroprior.behaviour.analysis.conditions import (
     compare_conditions,
 )
 from neuroprior.behaviour.analysis.interaction import LEVEL, ConditionInteraction
-from neuroprior.behaviour.report import figures
-from neuroprior.behaviour.report.document import Column, table
-from neuroprior.behaviour.report.findings import Finding, p_words
-from neuroprior.behaviour.report.page import FigureBox, Section, Table
-from neuroprior.behaviour.report.part import LISTED, Part, action_names, group_names, p_text
-from neuroprior.behaviour.report.scores import Evaluation
+from neuroprior.behaviour.reporting import figures
+from neuroprior.behaviour.reporting.document import Column, table
+from neuroprior.behaviour.reporting.findings import Finding, p_words
+from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
+from neuroprior.behaviour.reporting.part import LISTED, Part, action_names, group_names, p_text
+from neuroprior.behaviour.reporting.scores import Evaluation
 from neuroprior.plans.columns import listed
 
 DRAWN = 8  # features in the figure

@@ -19,13 +19,13 @@ from neuroprior.behaviour.analysis.modes import (
     mode_transitions,
 )
 from neuroprior.behaviour.analysis.motifs import motifs
-from neuroprior.behaviour.report import figures
-from neuroprior.behaviour.report.conditions import condition_section
-from neuroprior.behaviour.report.document import Column, table
-from neuroprior.behaviour.report.fits import counted
-from neuroprior.behaviour.report.page import FigureBox, Section, Table
-from neuroprior.behaviour.report.part import SIGNIFICANT, Part, action_names, p_text
-from neuroprior.behaviour.report.scores import Evaluation
+from neuroprior.behaviour.reporting import figures
+from neuroprior.behaviour.reporting.conditions import condition_section
+from neuroprior.behaviour.reporting.document import Column, table
+from neuroprior.behaviour.reporting.fits import counted
+from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
+from neuroprior.behaviour.reporting.part import SIGNIFICANT, Part, action_names, p_text
+from neuroprior.behaviour.reporting.scores import Evaluation
 from neuroprior.plans import BLOCKS, Plans, in_parts
 from neuroprior.priors import SwitchingPrior
 from neuroprior.priors.learning import plans_for

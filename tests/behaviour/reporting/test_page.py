@@ -16,8 +16,8 @@ from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
 from neuroprior.behaviour.recorded_plans import RecordedPlans
-from neuroprior.behaviour.report.drawing import FEWER, KINDS, MARKOV, MORE, SPARE, STRIPS, drawn, short
-from neuroprior.behaviour.report.figures import (
+from neuroprior.behaviour.reporting.drawing import FEWER, KINDS, MARKOV, MORE, SPARE, STRIPS, drawn, short
+from neuroprior.behaviour.reporting.figures import (
     MOST_BINS,
     drift_figure,
     dwell_figure,
@@ -28,7 +28,7 @@ from neuroprior.behaviour.report.figures import (
     score_figure,
     transition_figure,
 )
-from neuroprior.behaviour.report.page import INK, PAPER, FigureBox, Section, Table, clean, svg, write_page
+from neuroprior.behaviour.reporting.page import INK, PAPER, FigureBox, Section, Table, clean, svg, write_page
 from neuroprior.plans import Plans
 from tests.support.browser import check_in_browser
 from tests.support.sources import refuses

@@ -6,8 +6,8 @@ typical of them. Each of its figures is a function of its own, and `Document` an
 Needs pandas, matplotlib, jinja2, joblib and rich (`pip install 'neuroprior[report]'`).
 """
 
-from neuroprior.behaviour.report.document import Document, publish, table
-from neuroprior.behaviour.report.figures import (
+from neuroprior.behaviour.reporting.document import Document, publish, table
+from neuroprior.behaviour.reporting.figures import (
     condition_figure,
     drift_figure,
     dwell_figure,
@@ -19,9 +19,12 @@ from neuroprior.behaviour.report.figures import (
     score_figure,
     transition_figure,
 )
-from neuroprior.behaviour.report.options import FitOptions, ReadOptions
-from neuroprior.behaviour.report.page import FigureBox, Section, Table
-from neuroprior.behaviour.report.plan_report import report
+from neuroprior.behaviour.reporting.individuals import budget_strips, dendrogram_figure, plane_figure
+from neuroprior.behaviour.reporting.options import FitOptions, ReadOptions
+from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
+from neuroprior.behaviour.reporting.plan_report import report
+from neuroprior.behaviour.reporting.recordings import budget_figure, course_figure
+from neuroprior.behaviour.reporting.transitions import transition_graph_figure
 
 __all__ = [
     "Document",
@@ -30,7 +33,11 @@ __all__ = [
     "ReadOptions",
     "Section",
     "Table",
+    "budget_figure",
+    "budget_strips",
     "condition_figure",
+    "course_figure",
+    "dendrogram_figure",
     "drift_figure",
     "dwell_figure",
     "ethogram_figure",
@@ -38,9 +45,11 @@ __all__ = [
     "lag_figure",
     "motif_figure",
     "occupancy_figure",
+    "plane_figure",
     "publish",
     "report",
     "score_figure",
     "table",
     "transition_figure",
+    "transition_graph_figure",
 ]

@@ -19,8 +19,8 @@ from neuroprior.behaviour.analysis.comparison import Score, action_bits, score_b
 from neuroprior.behaviour.durations.past_durations import PastDurations
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.recordings import Recordings
-from neuroprior.behaviour.report import fits
-from neuroprior.behaviour.report.fits import (
+from neuroprior.behaviour.reporting import fits
+from neuroprior.behaviour.reporting.fits import (
     ACTIONS,
     COMBINED,
     CONTEXT,

@@ -19,7 +19,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
 from neuroprior.behaviour.recorded_plans import RecordedPlans
-from neuroprior.behaviour.report.drawing import (
+from neuroprior.behaviour.reporting.drawing import (
     FEWER,
     MORE,
     PLAIN,
@@ -42,8 +42,8 @@ from neuroprior.behaviour.report.drawing import (
     short,
     whole_numbers,
 )
-from neuroprior.behaviour.report.page import INK, clean
-from neuroprior.behaviour.report.part import action_names, group_names
+from neuroprior.behaviour.reporting.page import INK, clean
+from neuroprior.behaviour.reporting.part import action_names, group_names
 from neuroprior.plans import Plans
 from neuroprior.plans.plans import check_are_plans
 

@@ -10,13 +10,13 @@ import torch
 
 from neuroprior.behaviour.analysis.comparison import score_bits
 from neuroprior.behaviour.recorded_plans import RecordedPlans
-from neuroprior.behaviour.report.document import Document
-from neuroprior.behaviour.report.durations import chain_bits
-from neuroprior.behaviour.report.figures import MOST_PANELS, dwell_figure
-from neuroprior.behaviour.report.part import Part
-from neuroprior.behaviour.report.plan_report import report
-from neuroprior.behaviour.report.scores import evaluate_saved
-from neuroprior.behaviour.report.sections import SECTIONS
+from neuroprior.behaviour.reporting.document import Document
+from neuroprior.behaviour.reporting.durations import chain_bits
+from neuroprior.behaviour.reporting.figures import MOST_PANELS, dwell_figure
+from neuroprior.behaviour.reporting.part import Part
+from neuroprior.behaviour.reporting.plan_report import report
+from neuroprior.behaviour.reporting.scores import evaluate_saved
+from neuroprior.behaviour.reporting.sections import SECTIONS
 from neuroprior.plans import BLOCKS, Plans, write_plans
 from neuroprior.priors import UniformPrior
 from tests.support.reports import QUICK_IN_TWO

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from neuroprior.behaviour import read
-from neuroprior.behaviour.report.recordings import (
+from neuroprior.behaviour.reporting.recordings import (
     budget_figure,
     course_figure,
     subject_budget,

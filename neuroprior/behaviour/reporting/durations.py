@@ -14,12 +14,12 @@ from neuroprior.behaviour.analysis.comparison import Score, score_bits, unit_nam
 from neuroprior.behaviour.durations.duration_model import DurationModel
 from neuroprior.behaviour.durations.laws import resolution
 from neuroprior.behaviour.recorded_plans import RecordedPlans, durations_of
-from neuroprior.behaviour.report import figures
-from neuroprior.behaviour.report.document import Column, table
-from neuroprior.behaviour.report.fits import ACTIONS, DURATIONS
-from neuroprior.behaviour.report.page import FigureBox, Section
-from neuroprior.behaviour.report.part import LISTED, Part, action_names, p_text
-from neuroprior.behaviour.report.scores import Evaluation
+from neuroprior.behaviour.reporting import figures
+from neuroprior.behaviour.reporting.document import Column, table
+from neuroprior.behaviour.reporting.fits import ACTIONS, DURATIONS
+from neuroprior.behaviour.reporting.page import FigureBox, Section
+from neuroprior.behaviour.reporting.part import LISTED, Part, action_names, p_text
+from neuroprior.behaviour.reporting.scores import Evaluation
 from neuroprior.plans import BLOCKS, FEWEST_UNITS, Plans, divisible, folds, in_parts
 from neuroprior.plans.folds import num_units
 from neuroprior.priors import MarkovPrior

@@ -9,8 +9,8 @@ import torch
 
 from neuroprior.behaviour.analysis.comparison import DEPTH, score_bits, units
 from neuroprior.behaviour.recorded_plans import RecordedPlans
-from neuroprior.behaviour.report import fits
-from neuroprior.behaviour.report.fits import (
+from neuroprior.behaviour.reporting import fits
+from neuroprior.behaviour.reporting.fits import (
     ACTIONS,
     COMBINED,
     CONTEXT,
@@ -22,7 +22,7 @@ from neuroprior.behaviour.report.fits import (
     fit_and_score,
     split,
 )
-from neuroprior.behaviour.report.scores import Evaluation, cross_validation, evaluate, jobs
+from neuroprior.behaviour.reporting.scores import Evaluation, cross_validation, evaluate, jobs
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import folds, in_parts
 from neuroprior.priors import ContextTreePrior, GRUPrior, MarkovPrior, Prior, StackedPrior

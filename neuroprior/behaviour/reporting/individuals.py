@@ -20,8 +20,8 @@ from neuroprior.behaviour.analysis.individuals import (
 )
 from neuroprior.behaviour.analysis.transitions import transitions
 from neuroprior.behaviour.recorded_plans import RecordedPlans
-from neuroprior.behaviour.report.document import Column, table
-from neuroprior.behaviour.report.drawing import (
+from neuroprior.behaviour.reporting.document import Column, table
+from neuroprior.behaviour.reporting.drawing import (
     SPARE,
     STRIPS,
     WIDTH,
@@ -33,10 +33,10 @@ from neuroprior.behaviour.report.drawing import (
     panels,
     short,
 )
-from neuroprior.behaviour.report.findings import LEVEL, Finding, p_words
-from neuroprior.behaviour.report.page import INK, FigureBox, Section
-from neuroprior.behaviour.report.part import Part, action_names, group_names, without_verdict
-from neuroprior.behaviour.report.scores import Evaluation
+from neuroprior.behaviour.reporting.findings import LEVEL, Finding, p_words
+from neuroprior.behaviour.reporting.page import INK, FigureBox, Section
+from neuroprior.behaviour.reporting.part import Part, action_names, group_names, without_verdict
+from neuroprior.behaviour.reporting.scores import Evaluation
 
 OTHER = "#7d838c"
 

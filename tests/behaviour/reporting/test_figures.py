@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 
 from neuroprior.behaviour.recorded_plans import RecordedPlans
-from neuroprior.behaviour.report.drawing import FEWER, KINDS, MARKOV, MORE, SPARE, STRIPS, colors, lines
-from neuroprior.behaviour.report.figures import (
+from neuroprior.behaviour.reporting.drawing import FEWER, KINDS, MARKOV, MORE, SPARE, STRIPS, colors, lines
+from neuroprior.behaviour.reporting.figures import (
     condition_figure,
     drift_figure,
     dwell_figure,

@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
-from neuroprior.behaviour.report.page import PAPER, STYLE, clean
+from neuroprior.behaviour.reporting.page import PAPER, STYLE, clean
 
 Number = float | None
 """A value, or None where there is none."""

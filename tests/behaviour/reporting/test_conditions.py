@@ -7,11 +7,11 @@ import torch
 
 from neuroprior import Plans
 from neuroprior.behaviour import compare_conditions
-from neuroprior.behaviour.report.conditions import DRAWN, condition_section
-from neuroprior.behaviour.report.document import results_of
-from neuroprior.behaviour.report.part import LISTED, Part
-from neuroprior.behaviour.report.plan_report import report
-from neuroprior.behaviour.report.scores import evaluate_saved
+from neuroprior.behaviour.reporting.conditions import DRAWN, condition_section
+from neuroprior.behaviour.reporting.document import results_of
+from neuroprior.behaviour.reporting.part import LISTED, Part
+from neuroprior.behaviour.reporting.plan_report import report
+from neuroprior.behaviour.reporting.scores import evaluate_saved
 from neuroprior.priors import UniformPrior
 from tests.support.reports import QUICK_IN_TWO
 from tests.support.sources import seeded

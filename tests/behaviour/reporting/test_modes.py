@@ -10,11 +10,11 @@ import torch
 
 from neuroprior import Plans
 from neuroprior.behaviour import RecordedPlans, choose_modes, mode_table, motifs
-from neuroprior.behaviour.report.figures import group_transition_figure
-from neuroprior.behaviour.report.fits import counted
-from neuroprior.behaviour.report.modes import MOST_MOTIFS, mode_section
-from neuroprior.behaviour.report.part import Part
-from neuroprior.behaviour.report.scores import evaluate_saved
+from neuroprior.behaviour.reporting.figures import group_transition_figure
+from neuroprior.behaviour.reporting.fits import counted
+from neuroprior.behaviour.reporting.modes import MOST_MOTIFS, mode_section
+from neuroprior.behaviour.reporting.part import Part
+from neuroprior.behaviour.reporting.scores import evaluate_saved
 from neuroprior.priors import UniformPrior
 from tests.support.sources import seeded
 

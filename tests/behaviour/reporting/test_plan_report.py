@@ -10,10 +10,10 @@ import torch
 
 from neuroprior import Plans
 from neuroprior.behaviour import read
-from neuroprior.behaviour.report import plan_report
-from neuroprior.behaviour.report.document import Document
-from neuroprior.behaviour.report.options import FitOptions, ReadOptions
-from neuroprior.behaviour.report.plan_report import report
+from neuroprior.behaviour.reporting import plan_report
+from neuroprior.behaviour.reporting.document import Document
+from neuroprior.behaviour.reporting.options import FitOptions, ReadOptions
+from neuroprior.behaviour.reporting.plan_report import report
 from neuroprior.priors import MarkovPrior, UniformPrior, save
 from neuroprior.priors.scoring import keep_learned
 from tests.support.chains import markov_plans, markov_probs

@@ -8,12 +8,12 @@ from matplotlib.patches import FancyArrowPatch
 
 from neuroprior.behaviour.analysis.comparison import too_few
 from neuroprior.behaviour.analysis.transitions import Transitions, transitions
-from neuroprior.behaviour.report.document import Column, table
-from neuroprior.behaviour.report.drawing import PLAIN, WIDTH, drawn, panels, short
-from neuroprior.behaviour.report.figures import group_transition_figure, transition_figure
-from neuroprior.behaviour.report.page import INK, PAPER, FigureBox, Section
-from neuroprior.behaviour.report.part import LISTED, Part, without_verdict
-from neuroprior.behaviour.report.scores import Evaluation
+from neuroprior.behaviour.reporting.document import Column, table
+from neuroprior.behaviour.reporting.drawing import PLAIN, WIDTH, drawn, panels, short
+from neuroprior.behaviour.reporting.figures import group_transition_figure, transition_figure
+from neuroprior.behaviour.reporting.page import INK, PAPER, FigureBox, Section
+from neuroprior.behaviour.reporting.part import LISTED, Part, without_verdict
+from neuroprior.behaviour.reporting.scores import Evaluation
 
 MOST_NODES = 20
 """Actions up to which the graph of transitions is drawn."""

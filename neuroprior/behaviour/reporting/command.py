@@ -9,9 +9,9 @@ from typing import Any
 from docstring_parser import parse
 from rich.console import Console
 
-from neuroprior.behaviour.report.document import PAGE, Document, FigureKind, show, show_headline
-from neuroprior.behaviour.report.options import INPUTS, FitOptions, InputName, ModelName, ReadOptions
-from neuroprior.behaviour.report.plan_report import report
+from neuroprior.behaviour.reporting.document import PAGE, Document, FigureKind, show, show_headline
+from neuroprior.behaviour.reporting.options import INPUTS, FitOptions, InputName, ModelName, ReadOptions
+from neuroprior.behaviour.reporting.plan_report import report
 from neuroprior.priors.ensembles.candidates import Effort
 
 

@@ -14,15 +14,15 @@ from neuroprior.behaviour.analysis.drift import action_drift, by_group, by_plan,
 from neuroprior.behaviour.analysis.lags import mutual_information
 from neuroprior.behaviour.analysis.motifs import motifs
 from neuroprior.behaviour.recorded_plans import RecordedPlans
-from neuroprior.behaviour.report import figures
-from neuroprior.behaviour.report.conditions import condition_section
-from neuroprior.behaviour.report.document import Column, table
-from neuroprior.behaviour.report.durations import duration_section
-from neuroprior.behaviour.report.fits import ACTIONS
-from neuroprior.behaviour.report.individuals import individual_section
-from neuroprior.behaviour.report.modes import mode_section
-from neuroprior.behaviour.report.page import FigureBox, Section
-from neuroprior.behaviour.report.part import (
+from neuroprior.behaviour.reporting import figures
+from neuroprior.behaviour.reporting.conditions import condition_section
+from neuroprior.behaviour.reporting.document import Column, table
+from neuroprior.behaviour.reporting.durations import duration_section
+from neuroprior.behaviour.reporting.fits import ACTIONS
+from neuroprior.behaviour.reporting.individuals import individual_section
+from neuroprior.behaviour.reporting.modes import mode_section
+from neuroprior.behaviour.reporting.page import FigureBox, Section
+from neuroprior.behaviour.reporting.part import (
     LISTED,
     SIGNIFICANT,
     Part,
@@ -31,9 +31,9 @@ from neuroprior.behaviour.report.part import (
     p_text,
     without_verdict,
 )
-from neuroprior.behaviour.report.recordings import recording_section
-from neuroprior.behaviour.report.scores import Evaluation
-from neuroprior.behaviour.report.transitions import transition_section
+from neuroprior.behaviour.reporting.recordings import recording_section
+from neuroprior.behaviour.reporting.scores import Evaluation
+from neuroprior.behaviour.reporting.transitions import transition_section
 from neuroprior.plans import Plans, constant_context, has_patterns
 
 MOST_LAG = 20

@@ -7,8 +7,8 @@ import networkx as nx
 import pandas as pd
 from torch import Tensor
 
-from neuroprior.behaviour.report.findings import Finding
-from neuroprior.behaviour.report.page import Section
+from neuroprior.behaviour.reporting.findings import Finding
+from neuroprior.behaviour.reporting.page import Section
 from neuroprior.plans import Plans
 
 LISTED = 12

@@ -21,10 +21,10 @@ from neuroprior.behaviour import (
     mutual_information,
 )
 from neuroprior.behaviour.recorded_plans import RecordedPlans
-from neuroprior.behaviour.report.conditions import condition_section
-from neuroprior.behaviour.report.fits import ACTIONS, CONTEXT
-from neuroprior.behaviour.report.scores import Evaluation, evaluate_saved
-from neuroprior.behaviour.report.sections import (
+from neuroprior.behaviour.reporting.conditions import condition_section
+from neuroprior.behaviour.reporting.fits import ACTIONS, CONTEXT
+from neuroprior.behaviour.reporting.scores import Evaluation, evaluate_saved
+from neuroprior.behaviour.reporting.sections import (
     action_frame,
     drift_section,
     file_section,

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from neuroprior._statistics import mean_interval
 from neuroprior.behaviour.recordings import KEYS, Recordings
-from neuroprior.behaviour.report.document import Column, table
-from neuroprior.behaviour.report.drawing import (
+from neuroprior.behaviour.reporting.document import Column, table
+from neuroprior.behaviour.reporting.drawing import (
     SPARE,
     WIDTH,
     at_edges,
@@ -20,9 +20,9 @@ from neuroprior.behaviour.report.drawing import (
     panels,
     short,
 )
-from neuroprior.behaviour.report.page import INK, FigureBox, Section
-from neuroprior.behaviour.report.part import LISTED, Part
-from neuroprior.behaviour.report.scores import Evaluation
+from neuroprior.behaviour.reporting.page import INK, FigureBox, Section
+from neuroprior.behaviour.reporting.part import LISTED, Part
+from neuroprior.behaviour.reporting.scores import Evaluation
 
 BINS = 10
 """Parts of the longest recording in which behaviours are counted."""

@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from neuroprior.behaviour.report.document import Document, show, write_document
-from neuroprior.behaviour.report.page import Section, Table
-from neuroprior.behaviour.report.part import p_text
+from neuroprior.behaviour.reporting.document import Document, show, write_document
+from neuroprior.behaviour.reporting.page import Section, Table
+from neuroprior.behaviour.reporting.part import p_text
 from tests.support.sources import refuses
 
 

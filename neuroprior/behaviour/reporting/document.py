@@ -21,8 +21,8 @@ from rich.markup import escape
 from rich.text import Text
 
 from neuroprior._files import read_json, versions, write_json, write_whole, written_whole
-from neuroprior.behaviour.report.findings import Sentence
-from neuroprior.behaviour.report.page import Section, Table, clean, write_page
+from neuroprior.behaviour.reporting.findings import Sentence
+from neuroprior.behaviour.reporting.page import Section, Table, clean, write_page
 
 Column = str | Callable[[Any], str]
 

@@ -16,9 +16,9 @@ from neuroprior.behaviour.durations.past_durations import PastDurations
 from neuroprior.behaviour.reading.read import read_recordings
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.recordings import Recordings
-from neuroprior.behaviour.report.document import Document, FigureKind, check_place, write_document, write_figures
-from neuroprior.behaviour.report.findings import headline
-from neuroprior.behaviour.report.fits import (
+from neuroprior.behaviour.reporting.document import Document, FigureKind, check_place, write_document, write_figures
+from neuroprior.behaviour.reporting.findings import headline
+from neuroprior.behaviour.reporting.fits import (
     ACTIONS,
     CONTEXT,
     COSTS,
@@ -30,10 +30,17 @@ from neuroprior.behaviour.report.fits import (
     Job,
     counted,
 )
-from neuroprior.behaviour.report.options import Files, FitOptions, ReadOptions, check_choices, is_recording, name_files
-from neuroprior.behaviour.report.part import Part
-from neuroprior.behaviour.report.scores import Evaluation, cross_validation, evaluate, evaluate_saved, jobs
-from neuroprior.behaviour.report.sections import OF_MODELS, SECTIONS, describe
+from neuroprior.behaviour.reporting.options import (
+    Files,
+    FitOptions,
+    ReadOptions,
+    check_choices,
+    is_recording,
+    name_files,
+)
+from neuroprior.behaviour.reporting.part import Part
+from neuroprior.behaviour.reporting.scores import Evaluation, cross_validation, evaluate, evaluate_saved, jobs
+from neuroprior.behaviour.reporting.sections import OF_MODELS, SECTIONS, describe
 from neuroprior.plans import Plans
 from neuroprior.plans.columns import listed
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
@@ -81,7 +88,7 @@ def report(
         skip: actions at the beginning of each plan that do not count in scores.
         fits: which models are fitted, and how.
         reading: how files are read; None for plans in memory.
-        sections: which to make, of `neuroprior.behaviour.report.sections.SECTIONS`; all by default.
+        sections: which to make, of `neuroprior.behaviour.reporting.sections.SECTIONS`; all by default.
         figures: also write each figure to `figures` below `out`, for papers: pdf, svg or png.
         command: the command line that makes the report again, for the page.
         each: is called with what needs no network as soon as this is written, and again as more is there.
