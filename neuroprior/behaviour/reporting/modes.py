@@ -22,6 +22,7 @@ from neuroprior.behaviour.analysis.motifs import motifs
 from neuroprior.behaviour.reporting import figures
 from neuroprior.behaviour.reporting.conditions import condition_section
 from neuroprior.behaviour.reporting.document import Column, table
+from neuroprior.behaviour.reporting.findings import Finding
 from neuroprior.behaviour.reporting.fits import counted
 from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
 from neuroprior.behaviour.reporting.part import SIGNIFICANT, Part, action_names, p_text
@@ -114,6 +115,7 @@ def mode_section(found: Evaluation) -> Part | None:
         "mode_occupancy": occupied,
         "mode_actions": mode_frame(prior, plans),
     }
+    findings: list[Finding] = []
     if own.condition is not None:
         part = condition_section(replace(found, plans=own))
         assert part is not None
@@ -121,7 +123,11 @@ def mode_section(found: Evaluation) -> Part | None:
         tables += [replace(one, title=f"Modes: {one.title[:1].lower()}{one.title[1:]}") for one in part.section.tables]
         boxes += [replace(box, name=f"mode_{box.name}") for box in part.section.figures]
         frames |= {f"mode_{name}": frame for name, frame in part.frames.items()}
-    return Part(Section("Hidden modes", text, tables, boxes), frames)
+        findings = [
+            replace(one, id=f"modes: {one.id}", family=f"modes: {one.family}", feature=f"{one.feature} (modes)")
+            for one in part.findings
+        ]
+    return Part(Section("Hidden modes", text, tables, boxes), frames, findings=findings)
 
 
 def choice_table(choice: ModeChoice) -> Table:

@@ -170,6 +170,8 @@ def budget_figure(budget: pd.DataFrame, each: pd.DataFrame) -> Figure:
 def course_figure(course: pd.DataFrame) -> Figure:
     """How the share of each behaviour changes over time: a panel a behaviour, a line with its band a level.
 
+    Times at which less than half of the subjects of a level were watched are left out.
+
     Args:
         course: of `time_course`.
     """
@@ -182,7 +184,9 @@ def course_figure(course: pd.DataFrame) -> Figure:
     for axes, behaviour in zip(cells, shown, strict=False):
         for level in levels:
             own = course[(course["behaviour"] == behaviour) & (course["level"] == level)]
-            rows = own[["time", "share", "low", "high"]].mul([1, 100, 100, 100]).to_numpy()
+            own = own[own["subjects"] >= own["subjects"].max() / 2]
+            bounds = own[["share", "low", "high"]].clip(0, 1).mul(100)
+            rows = np.column_stack([own["time"], bounds])
             band(axes, rows, hues[level], short(str(level), 20), "-")
         axes.set_title(short(str(behaviour), 24), fontsize=9)
         axes.set_ylim(bottom=0)
