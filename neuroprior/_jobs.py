@@ -13,7 +13,6 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache, partial
-from math import isnan, nan
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -305,7 +304,7 @@ class Progress:
 
     def __init__(self, title: str, total: int, missing: int, cost: float | None = None, beside: float = 0.0) -> None:
         self.title, self.total, self.missing, self.done = title, total, missing, 0
-        self._cost, self._spent = float(missing if cost is None else cost), 0.0
+        self._cost, self._spent, self._expected = float(missing if cost is None else cost), 0.0, 0.0
         self._begun_half = beside / 2  # when a job is finished, those beside it are half done on average
         self._bar: Any = None
         self._ended = threading.Event()
@@ -334,32 +333,31 @@ class Progress:
             self._bar.stop()
 
     def advance(self, what: str, cost: float = 1.0) -> float:
-        """Report a finished job of this cost; returns the seconds that are left, about."""
+        """Report a finished job of this cost; returns the seconds that are left, about, at the speed so far."""
         self.done += 1
         self._spent += cost
-        left = self._say(what)
+        gone = time.monotonic() - self._begun
+        done = self._spent + min(self._begun_half, (self._cost - self._spent) / 2)
+        self._expected = gone * self._cost / done
+        self._say(what, gone)
+        left = self._expected - gone
         if self._bar is not None:
             self._bar.update(self._task, advance=1, left=f"{_clock(left)} left")
         return left
 
-    def _say(self, what: str) -> float:
-        """Print a line, unless there is a bar; returns the seconds that are left at the speed so far, NaN at first."""
-        self._said = time.monotonic()
-        gone, rest, left = self._said - self._begun, self._cost - self._spent, nan
-        half = min(self._begun_half, rest / 2)
-        if self.done:
-            left = gone * (rest - half) / (self._spent + half)
+    def _say(self, what: str, gone: float) -> None:
+        """Print a line, unless there is a bar."""
+        self._said = self._begun + gone
         if self._bar is None:
             count = f"{self.total - self.missing + self.done}/{self.total}"
-            times = _clock(gone) + ("" if isnan(left) else f", about {_clock(left)} left")
-            print(f"{self.title}: {count} {what} ({times})", file=sys.stderr, flush=True)
-        return left
+            left = f", about {_clock(max(self._expected - gone, 0))} left" if self.done else ""
+            print(f"{self.title}: {count} {what} ({_clock(gone)}{left})", file=sys.stderr, flush=True)
 
     def _watch(self) -> None:
         """Say something where no job was finished for a while."""
         while not self._ended.wait(1):
             if time.monotonic() - self._said >= QUIET_SECONDS:
-                self._say("finished")
+                self._say("finished", time.monotonic() - self._begun)
 
 
 @contextmanager
