@@ -84,6 +84,7 @@ WITHOUT_EXAMPLE = {
             "GaussianForecast",
             "GroupDrift",
             "HorizonRound",
+            "Individuals",
         ),
         *(
             "ConditionInteraction",
@@ -97,12 +98,13 @@ WITHOUT_EXAMPLE = {
             "Motif",
         ),
         *("PermutationDesign", "PlanDrift", "PositionDrift", "Posterior", "Rollout", "Row", "Score", "Search"),
-        *("Sizes", "Steps", "Sweep", "TooLargeError", "Transitions", "Tuned", "VectorDecision"),
+        *("Sizes", "Steps", "Sweep", "TooLargeError", "Transitions", "Tuned", "Types", "VectorDecision"),
     },
     "made by a function that has one": {"PocketCube", "SlidingTilesWorld", "SimulatorWorld", "SokobanWorld"},
     "of packages or data that not everybody has": {"from_mujoco", "read_minari", "write_minari"},
     "figures of the report's tables": {
-        *("condition_figure", "drift_figure", "dwell_figure"),
+        *("budget_figure", "budget_strips", "condition_figure", "course_figure", "dendrogram_figure"),
+        *("drift_figure", "dwell_figure", "plane_figure", "transition_graph_figure"),
         *("group_transition_figure", "lag_figure", "motif_figure", "occupancy_figure"),
         *("score_figure", "transition_figure"),
     },

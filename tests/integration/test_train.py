@@ -121,7 +121,7 @@ def test_the_table_is_of_the_held_out_plans(tmp_path, monkeypatch, capsys):
     assert all(learned_from(out, learned))
     assert all(learned_from(out, chosen_on))
     assert not all(learned_from(out, held_out))
-    again = MarkovPrior(3, 3).fit(learned)
+    again = MarkovPrior(**load(out).config).fit(learned)
     assert torch.equal(again.log_prob(held_out.actions), load(out).log_prob(held_out.actions))
     assert "never" not in capsys.readouterr().out
     write_plans(replace(some_plans(), num_actions=5), tmp_path / "more.npz")

@@ -59,7 +59,8 @@ class Transitions:
         permutations: how many were made; 0 without any.
         low, high: float64 `[1 + G, A, A]`: the 95 % interval of each probability, of all and then of each group: over
             plans within a group, else over groups (subjects); NaN where there is one only.
-        action_names: A names; group_names: G of them.
+        action_names: A names.
+        group_names: G names.
     """
 
     counts: Tensor

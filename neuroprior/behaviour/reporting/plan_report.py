@@ -106,7 +106,7 @@ def report(
         >>> fits = FitOptions(models=["counts"], folds=2, processes=1)
         >>> found = report(plans, fits=fits, sections=["transitions"])
         >>> list(found.figures)
-        ['transitions']
+        ['transitions', 'transition_graph']
     """
     check_choices("sections", sections, tuple(SECTIONS))
     check_count("skip", skip, 0)
