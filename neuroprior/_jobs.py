@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from neuroprior._files import read_json, versions, write_json
-from neuroprior._threads import one_thread
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -207,6 +206,8 @@ def _attempt(run: Callable[[Job], Result], job: Job, index: int, parent: int | N
     """Do a job in one thread, since the number of threads changes the last digits."""
     if parent is not None and parent != os.getpid():
         _end_with(parent)
+    from neuroprior._threads import one_thread  # torch takes seconds
+
     try:
         with one_thread():
             return index, run(job)

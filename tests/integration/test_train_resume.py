@@ -18,7 +18,7 @@ from tests.integration.test_train import ROOT, check_refusal, metrics, small, so
 
 pytestmark = pytest.mark.usefixtures("undrawn")
 
-CUT = ["--check_every", "3", "--max_steps", "15", "--prior.dropout", "0.1"]
+CUT = ["--folds", "1", "--check_every", "3", "--max_steps", "15", "--prior.dropout", "0.1"]
 
 DRIVER = """
 import os, resource, signal, sys

@@ -177,8 +177,8 @@ def write_document(document: Document, folder: Path) -> None:
 def results_of(document: Document) -> dict[str, Any]:
     """What `results.json` holds: the rows of each frame, further results, settings and versions."""
     rows = {document.keys.get(name, name): records(frame) for name, frame in document.frames.items()}
-    headline = [asdict(one) for one in document.headline]
-    made = {"headline": headline, **document.results, "settings": dict(document.settings), "versions": versions()}
+    headline = {"headline": [asdict(one) for one in document.headline]} if document.headline else {}
+    made = {**headline, **document.results, "settings": dict(document.settings), "versions": versions()}
     return {**rows, **made}
 
 
