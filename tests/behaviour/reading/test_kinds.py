@@ -210,7 +210,7 @@ def test_columns_of_behaviours(study):
         ("f.csv", "animal|behaviour\nm1|rest\nm1|walk é\n".encode("utf-16")),
         ("f.csv", "animal\tbehaviour\nm1\trest\nm1\twalk é\n".encode("utf-16-le")),
         ("f.txt", "animal;behaviour\r\nm1;rest\r\nm1;walk é\r\n".encode("cp1252")),
-        ("f.csv.gz", gzip.compress("animal,behaviour\nm1,rest\nm1,walk é".encode("utf-8-sig"))),
+        ("f.csv.gz", gzip.compress("animal,behaviour\nm1,rest\nm1,walk é".encode("utf-8-sig"), mtime=0)),
         ("f.tsv", 'sep=;\nanimal;behaviour\nm1;rest\nm1;"walk é"\n'.encode()),
     ],
 )
