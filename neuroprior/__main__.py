@@ -14,7 +14,9 @@ COMMANDS = {
     ),
     "fit": Command("neuroprior.cli.fit:run", "train a prior on executed plans and save it", raw=True),
     "report": Command(
-        "neuroprior.behaviour.reporting.command:plans", "report on a file of plans: structure, models, figures"
+        "neuroprior.behaviour.reporting.command:plans",
+        "report on a file of plans: structure, models, figures",
+        slow=True,
     ),
     "score": Command("neuroprior.cli.score:score", "log-likelihood and bits per action of plans under a saved prior"),
     "sample": Command("neuroprior.cli.sample:sample", "new plans from a saved prior"),

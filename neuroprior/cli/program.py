@@ -6,6 +6,7 @@ import sys
 import threading
 from argparse import ArgumentError
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import nullcontext
 from importlib import import_module
 from textwrap import shorten
 from types import NoneType, UnionType
@@ -28,11 +29,13 @@ class Command(NamedTuple):
         target: `module:function`, imported only when the command is given.
         about: one line for the list of commands.
         raw: the function parses its arguments itself: it is called with the list of them.
+        slow: it works for minutes, so that it says something where importing it takes long, too.
     """
 
     target: str
     about: str
     raw: bool = False
+    slow: bool = False
 
     def load(self) -> Callable[..., Any]:
         """Import the function."""
@@ -71,7 +74,7 @@ def run_commands(
         if name not in commands:
             raise ValueError(f"{name!r} is no command; there are {', '.join(commands)}")
         command = commands[name]
-        with saying(f"{program} {name}: starting"):
+        with saying(f"{program} {name}: starting") if command.slow else nullcontext():
             function = command.load()
         if command.raw:
             function(options)
