@@ -24,6 +24,9 @@ from numpy.typing import ArrayLike
 
 from neuroprior._checks import check_count, check_sizes
 
+LEVEL = 0.05
+"""P-values below this are significant."""
+
 ENOUGH_UNITS = 5
 """Independent units below which no verdict is drawn: intervals are given, and nothing is called significant."""
 

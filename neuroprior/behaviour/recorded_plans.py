@@ -97,6 +97,21 @@ class RecordedPlans(Plans):
         return plans if isinstance(plans, cls) else cls(**vars(plans))
 
 
+def action_names(plans: Plans) -> list[str]:
+    """Names of the actions; their numbers where they have none."""
+    return list(plans.action_names or map(str, range(plans.num_actions)))
+
+
+def group_names(plans: Plans, groups: Tensor) -> list[str]:
+    """Names of these groups; their numbers where they have none."""
+    return numbered_names(plans.group_names, groups, "group")
+
+
+def numbered_names(names: Sequence[str] | None, numbers: Tensor, what: str) -> list[str]:
+    """Names of these `numbers [n]`; "condition 3" and the like where there are none."""
+    return [names[number] if names else f"{what} {number}" for number in numbers.tolist()]
+
+
 def durations_of(plans: Plans) -> Tensor:
     """The durations `[N, L]` of plans; ValueError where they have none."""
     durations = plans.durations if isinstance(plans, RecordedPlans) else None

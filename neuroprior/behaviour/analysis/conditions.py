@@ -15,13 +15,13 @@ from scipy.special import stdtrit
 from torch import Tensor
 
 from neuroprior._checks import check_sizes
-from neuroprior._statistics import ENOUGH_UNITS, Difference, holm, ratio_difference
+from neuroprior._statistics import ENOUGH_UNITS, LEVEL, Difference, holm, ratio_difference
 from neuroprior.behaviour.analysis.condition_chains import SMOOTHING, ConditionChains
 from neuroprior.behaviour.analysis.flat import FlatPlans, ranks
-from neuroprior.behaviour.analysis.interaction import LEVEL, ConditionInteraction, compare_strata
+from neuroprior.behaviour.analysis.interaction import ConditionInteraction, compare_strata
 from neuroprior.behaviour.analysis.permutation_design import PermutationDesign
 from neuroprior.behaviour.analysis.permutation_tests import TIE, combine_tests, largest_statistics, shares_reaching
-from neuroprior.behaviour.recorded_plans import RecordedPlans
+from neuroprior.behaviour.recorded_plans import RecordedPlans, numbered_names
 from neuroprior.plans.columns import listed
 from neuroprior.plans.plans import check_are_plans
 
@@ -208,13 +208,11 @@ def _compare(
 ) -> ConditionComparison:
     """The comparison of all conditions, without contrasts; on request with the interaction of conditions and strata."""
     design = PermutationDesign.of(plans)
-    names = [
-        plans.condition_names[c] if plans.condition_names else f"condition {c}" for c in design.conditions.tolist()
-    ]
+    names = numbered_names(plans.condition_names, design.conditions, "condition")
     if design.untestable:
         verdict = " ".join(f"{text}." for text in (f"Not tested: {design.untestable}", design.odd) if text)
         return ConditionComparison(design, names, [], None, {}, nan, 0, False, nan, False, verdict)
-    strata = [plans.stratum_names[s] if plans.stratum_names else f"stratum {s}" for s in design.strata.tolist()]
+    strata = numbered_names(plans.stratum_names, design.strata, "stratum")
     kept = (design.block >= 0).to(plans.actions.device)
     plans, of_plan = plans[kept], design.block[design.block >= 0]
     flat = _on_cpu(FlatPlans.of(plans))

@@ -7,11 +7,11 @@ import numpy as np
 import pandas as pd
 import torch
 from numpy.typing import NDArray
-from scipy.special import logsumexp
+from scipy.special import logsumexp, rel_entr
 
 from neuroprior._random import generator_on
 from neuroprior.behaviour.analysis.flat import FlatPlans
-from neuroprior.behaviour.recorded_plans import RecordedPlans
+from neuroprior.behaviour.recorded_plans import RecordedPlans, action_names, numbered_names
 from neuroprior.behaviour.recordings import Recordings
 
 Array = NDArray[np.float64]
@@ -139,9 +139,8 @@ def _counts(plans: RecordedPlans | Recordings) -> tuple[list[str], list[str], Ar
         raise ValueError(f"`plans` must have at least two groups with transitions, got {len(present)}.")
     cell = (flat.actions[at] * size + flat.actions[at + 1]).cpu()
     counts = (rank * size**2 + cell).bincount(minlength=len(present) * size**2).view(-1, size, size)
-    item = "plan" if plans.group is None else "group"
-    names = [plans.group_names[g] if plans.group_names else f"{item} {g}" for g in present.tolist()]
-    return names, list(plans.action_names or map(str, range(size))), counts.double().numpy()
+    names = numbered_names(plans.group_names, present, "plan" if plans.group is None else "group")
+    return names, action_names(plans), counts.double().numpy()
 
 
 def _smoothed(counts: Array, total: Array) -> Array:
@@ -153,10 +152,15 @@ def _smoothed(counts: Array, total: Array) -> Array:
 
 def _distance(some: Array, others: Array, weight: Array) -> Array:
     """The distance of transition probabilities `[..., A, A]` with rows of this weight `[A]`."""
+    distance: Array = np.sqrt((divergence(some, others) * weight).sum(-1))
+    return distance
+
+
+def divergence(some: Array, others: Array) -> Array:
+    """The Jensen-Shannon divergence `[...]`, in bits, of probabilities `[..., A]`."""
     middle = (some + others) / 2
-    parts = [(one * np.log2(one / middle)).sum(-1) for one in (some, np.broadcast_to(others, some.shape))]
-    found: Array = np.sqrt(np.clip(((parts[0] + parts[1]) / 2 * weight).sum(-1), 0, None))
-    return found
+    bits: Array = (rel_entr(some, middle) + rel_entr(others, middle)).sum(-1) / (2 * np.log(2))
+    return bits.clip(min=0)
 
 
 def _scaled(distances: Array) -> Array:

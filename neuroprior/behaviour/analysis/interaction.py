@@ -11,11 +11,9 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from neuroprior._random import generator_on
+from neuroprior._statistics import LEVEL
 from neuroprior.behaviour.analysis.permutation_design import PermutationDesign, shuffle_within
 from neuroprior.behaviour.analysis.permutation_tests import combine_tests, largest_statistics
-
-LEVEL = 0.05
-"""P-values below this are significant."""
 
 MIN_FREEDOM = 4
 """Units that must be left after all means of strata and conditions are taken."""

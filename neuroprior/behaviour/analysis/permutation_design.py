@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neuroprior._random import generator_on
-from neuroprior.behaviour.recorded_plans import RecordedPlans
+from neuroprior.behaviour.recorded_plans import RecordedPlans, numbered_names
 from neuroprior.plans.columns import listed
 
 Kind = Literal["between", "within"]
@@ -84,7 +84,7 @@ class PermutationDesign:
         under = torch.zeros(len(numbers), len(conditions), dtype=torch.bool)
         under[unit, label] = True
         item, notes = "plans" if plans.group is None else "groups", []
-        names = [plans.condition_names[c] if plans.condition_names else f"condition {c}" for c in conditions.tolist()]
+        names = numbered_names(plans.condition_names, conditions, "condition")
 
         rare = under.sum(0) < MIN_UNITS
         if rare.any() and (~rare).sum() > 1:

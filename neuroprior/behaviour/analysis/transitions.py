@@ -15,7 +15,7 @@ from torch import Tensor
 from neuroprior._checks import check_sizes
 from neuroprior._random import generator_on
 from neuroprior.behaviour.analysis.flat import FlatPlans
-from neuroprior.behaviour.recorded_plans import RecordedPlans
+from neuroprior.behaviour.recorded_plans import RecordedPlans, action_names, numbered_names
 from neuroprior.behaviour.recordings import Recordings
 from neuroprior.plans import Plans
 
@@ -198,7 +198,6 @@ def transitions(
     whole = _interval(cell, subjects if len(subjects.unique()) > 1 else plan, size)
     each = [_interval(cell[own], units[own], size) for own in (group[plan] == g for g in range(len(groups)))]
     low, high = (torch.stack(ends) for ends in zip(whole, *each, strict=True))
-    numbered = "group" if by is None else "condition"
     return Transitions(
         group_counts.sum(0),
         group_counts,
@@ -210,8 +209,8 @@ def transitions(
         made,
         low,
         high,
-        list(plans.action_names or map(str, range(size))),
-        [names[g] if names else f"{numbered} {g}" for g in groups.tolist()],
+        action_names(plans),
+        numbered_names(names, groups, "group" if by is None else "condition"),
     )
 
 

@@ -1,23 +1,25 @@
 """The section on conditions: whether behaviour differs between them, and in what."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
 import torch
 
+from neuroprior._statistics import LEVEL
 from neuroprior.behaviour.analysis.conditions import (
     ConditionComparison,
     ConditionFamily,
     ConditionPrediction,
     compare_conditions,
 )
-from neuroprior.behaviour.analysis.interaction import LEVEL, ConditionInteraction
+from neuroprior.behaviour.analysis.interaction import ConditionInteraction
+from neuroprior.behaviour.recorded_plans import action_names, group_names
 from neuroprior.behaviour.reporting import figures
 from neuroprior.behaviour.reporting.document import Column, table
 from neuroprior.behaviour.reporting.findings import Finding, p_words
 from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
-from neuroprior.behaviour.reporting.part import LISTED, Part, action_names, group_names, p_text
+from neuroprior.behaviour.reporting.part import LISTED, Part, p_text
 from neuroprior.behaviour.reporting.scores import Evaluation
 from neuroprior.plans.columns import listed
 
@@ -228,12 +230,10 @@ def _features(result: ConditionComparison, actions: list[str]) -> pd.DataFrame:
     """A row a feature, those that differ most first; durations as geometric means and ratios."""
     parts = []
     for family in result.families:
-        joint = " → " if family.name == "transitions" else " "
         of_time = (lambda values: np.exp(values)) if family.name == "durations" else (lambda values: values)
         part = pd.DataFrame({"family": family.name, "place": range(len(family.features))})
-        spelled = [joint.join(actions[action] for action in own) for own in family.features.tolist()]
-        part["feature"] = [FAMILIES[family.name].format(own) for own in spelled]
-        part["parts"] = [[actions[action] for action in own] for own in family.features.tolist()]
+        part["parts"] = [[actions[action] for action in feature] for feature in family.features.tolist()]
+        part["feature"] = _feature_names(family.name, part["parts"])
         for name, *own in zip(result.condition_names, family.means, family.low, family.high, strict=True):
             for what, values in zip(("mean", "low", "high"), own, strict=True):
                 part[f"{what}, {name}"] = of_time(values.numpy())
@@ -248,6 +248,12 @@ def _features(result: ConditionComparison, actions: list[str]) -> pd.DataFrame:
     keys = {"rank": rank.where(frame["significant"], len(FAMILIES)), "size": -frame["statistic"]}
     frame = frame.assign(**keys).sort_values(["rank", "corrected", "p_value", "size"], kind="stable")
     return frame.drop(columns=list(keys)).reset_index(drop=True)
+
+
+def _feature_names(family: str, features: Iterable[Sequence[str]]) -> list[str]:
+    """What features of a family are called, from the names of their actions."""
+    joint = " → " if family == "transitions" else " "
+    return [FAMILIES[family].format(joint.join(actions)) for actions in features]
 
 
 def _feature_table(result: ConditionComparison, features: pd.DataFrame) -> Table:
@@ -308,9 +314,8 @@ def _interaction(found: ConditionInteraction, actions: list[str]) -> pd.DataFram
     """A row a feature, with the difference between two conditions in each stratum."""
     parts = []
     for family in found.families:
-        joint = " → " if family.name == "transitions" else " "
-        spelled = [joint.join(actions[action] for action in own) for own in family.features.tolist()]
-        part = pd.DataFrame({"family": family.name, "feature": [FAMILIES[family.name].format(own) for own in spelled]})
+        parts_of = [[actions[action] for action in feature] for feature in family.features.tolist()]
+        part = pd.DataFrame({"family": family.name, "feature": _feature_names(family.name, parts_of)})
         differences = family.differences.exp() if family.name == "durations" else family.differences
         for name, own in zip(found.stratum_names, differences, strict=True):
             part[f"difference, {name}"] = own.numpy()

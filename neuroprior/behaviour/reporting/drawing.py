@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from functools import wraps
+from itertools import cycle
 from typing import Any, ParamSpec
 from warnings import catch_warnings, filterwarnings
 
@@ -84,6 +85,11 @@ def colors(names: Sequence[str]) -> Iterator[str]:
         color = _kind(name.lower())
         spare += color is None
         yield color or SPARE[(spare - 1) % len(SPARE)]
+
+
+def level_colors(levels: Sequence[str]) -> dict[str, str]:
+    """A colour for each level of a factor, the spare ones in turn."""
+    return dict(zip(levels, cycle(SPARE), strict=False))
 
 
 def lines(names: Sequence[str]) -> Iterator[tuple[str, str]]:

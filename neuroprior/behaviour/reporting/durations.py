@@ -13,12 +13,12 @@ from neuroprior._statistics import ENOUGH_UNITS, ratio_difference
 from neuroprior.behaviour.analysis.comparison import Score, score_bits, unit_name
 from neuroprior.behaviour.durations.duration_model import DurationModel
 from neuroprior.behaviour.durations.laws import resolution
-from neuroprior.behaviour.recorded_plans import RecordedPlans, durations_of
+from neuroprior.behaviour.recorded_plans import RecordedPlans, action_names, durations_of
 from neuroprior.behaviour.reporting import figures
 from neuroprior.behaviour.reporting.document import Column, table
 from neuroprior.behaviour.reporting.fits import ACTIONS, DURATIONS
 from neuroprior.behaviour.reporting.page import FigureBox, Section
-from neuroprior.behaviour.reporting.part import LISTED, Part, action_names, p_text
+from neuroprior.behaviour.reporting.part import LISTED, Part, p_text
 from neuroprior.behaviour.reporting.scores import Evaluation
 from neuroprior.plans import BLOCKS, FEWEST_UNITS, Plans, divisible, folds, in_parts
 from neuroprior.plans.folds import num_units

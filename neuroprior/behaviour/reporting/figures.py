@@ -18,12 +18,11 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
-from neuroprior.behaviour.recorded_plans import RecordedPlans
+from neuroprior.behaviour.recorded_plans import RecordedPlans, action_names, group_names
 from neuroprior.behaviour.reporting.drawing import (
     FEWER,
     MORE,
     PLAIN,
-    SPARE,
     STRIPS,
     WIDTH,
     Array,
@@ -35,6 +34,7 @@ from neuroprior.behaviour.reporting.drawing import (
     expect_some,
     floats,
     legend,
+    level_colors,
     lines,
     marker,
     names_down,
@@ -43,7 +43,6 @@ from neuroprior.behaviour.reporting.drawing import (
     whole_numbers,
 )
 from neuroprior.behaviour.reporting.page import INK, clean
-from neuroprior.behaviour.reporting.part import action_names, group_names
 from neuroprior.plans import Plans
 from neuroprior.plans.plans import check_are_plans
 
@@ -292,7 +291,7 @@ def condition_figure(means: pd.DataFrame, values: pd.DataFrame, paired: bool = F
     features = list(means["feature"].unique())
     height = 0.62 + (0.36 if paired else 0.26) * len(conditions)
     figure, cells = panels(len(features), 1, (WIDTH, height * len(features) + 0.5))
-    hues = dict(zip(conditions, (SPARE * len(conditions))[: len(conditions)], strict=True))
+    hues = level_colors(conditions)
     for axes, feature in zip(cells, features, strict=True):
         own, mean = values[values["feature"] == feature], means[means["feature"] == feature]
         wide = own.pivot(index="unit", columns="condition", values="value").reindex(columns=conditions)

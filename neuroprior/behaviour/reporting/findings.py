@@ -4,9 +4,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-LEVEL = 0.05
-"""A finding is starred where its corrected p-value is below."""
-
 MOST_SENTENCES = 8
 """At the top of a report."""
 

@@ -10,16 +10,16 @@ from numpy.typing import ArrayLike
 from scipy.cluster.hierarchy import dendrogram, linkage
 from scipy.spatial.distance import squareform
 
-from neuroprior._statistics import ENOUGH_UNITS
+from neuroprior._statistics import ENOUGH_UNITS, LEVEL
 from neuroprior.behaviour.analysis.comparison import too_few
 from neuroprior.behaviour.analysis.individuals import (
     FEWEST_INDIVIDUALS,
     Individuals,
+    divergence,
     individual_types,
     individuals,
 )
-from neuroprior.behaviour.analysis.transitions import transitions
-from neuroprior.behaviour.recorded_plans import RecordedPlans
+from neuroprior.behaviour.recorded_plans import RecordedPlans, action_names, group_names, numbered_names
 from neuroprior.behaviour.reporting.document import Column, table
 from neuroprior.behaviour.reporting.drawing import (
     SPARE,
@@ -28,17 +28,17 @@ from neuroprior.behaviour.reporting.drawing import (
     Array,
     drawn,
     legend,
+    level_colors,
     marker,
     names_down,
     panels,
     short,
 )
-from neuroprior.behaviour.reporting.findings import LEVEL, Finding, p_words
+from neuroprior.behaviour.reporting.figures import OTHER
+from neuroprior.behaviour.reporting.findings import Finding, p_words
 from neuroprior.behaviour.reporting.page import INK, FigureBox, Section
-from neuroprior.behaviour.reporting.part import Part, action_names, group_names, without_verdict
+from neuroprior.behaviour.reporting.part import Part, without_verdict
 from neuroprior.behaviour.reporting.scores import Evaluation
-
-OTHER = "#7d838c"
 
 
 def individual_section(found: Evaluation) -> Part | None:
@@ -95,8 +95,7 @@ def individual_section(found: Evaluation) -> Part | None:
             )
         )
     most = frame.iloc[int(frame["distance"].argmax())]
-    tested = transitions(plans, generator=generator)
-    p_value = tested.p_value
+    p_value = found.transitions.p_value
     sentence = (
         f"Individuals differ in their transitions ({p_words(p_value)}), most of all {most.individual}: its distance"
         f" from the others is {most.distance:.3f}, 95 % interval {most.low:.3f} to {most.high:.3f} ({most.differs_in})."
@@ -104,7 +103,7 @@ def individual_section(found: Evaluation) -> Part | None:
     estimate = (float(most.distance), float(most.low), float(most.high))
     starred = bool(enough and p_value < LEVEL)
     findings = [Finding("individuals", "individuals", "individuals", *estimate, p_value, p_value, starred, sentence)]
-    if tested.test == "none":
+    if found.transitions.test == "none":
         findings = []
     elif not starred:
         text.append(without_verdict(too_few(plans)) or f"That they differ was not found ({p_words(p_value)}).")
@@ -127,10 +126,10 @@ def _conditions(plans: RecordedPlans, result: Individuals) -> list[str]:
     if plans.condition is None or plans.group is None:
         return [""] * len(result.names)
     pairs = torch.stack([plans.group.long(), plans.condition.long()]).unique(dim=1)
-    names = plans.condition_names or [f"condition {c}" for c in range(int(pairs[1].max()) + 1)]
+    conditions = numbered_names(plans.condition_names, pairs[1], "condition")
     under: dict[str, list[str]] = {}
-    for name, condition in zip(group_names(plans, pairs[0]), pairs[1].tolist(), strict=True):
-        under.setdefault(name, []).append(names[condition])
+    for name, condition in zip(group_names(plans, pairs[0]), conditions, strict=True):
+        under.setdefault(name, []).append(condition)
     return [under[name][0] if len(under[name]) == 1 else "" for name in result.names]
 
 
@@ -175,7 +174,7 @@ def plane_figure(places: ArrayLike, names: Sequence[str], condition: Sequence[st
     points = np.asarray(places, dtype=np.float64)
     figure, (axes,) = panels(1, 1, (WIDTH * 0.75, WIDTH * 0.6))
     kinds = sorted(set(condition))
-    hues = dict(zip(kinds, (SPARE * len(kinds))[: len(kinds)], strict=True))
+    hues = level_colors(kinds)
     for (x, y), name, kind in zip(points, names, condition, strict=True):
         axes.plot(x, y, "o", ms=7, color=hues[kind], mew=0, alpha=0.8)
         axes.annotate(short(name, 14), (x, y), xytext=(5, 4), textcoords="offset points", fontsize=8)
@@ -194,11 +193,7 @@ def dendrogram_figure(probs: Array, names: Sequence[str]) -> Figure:
         probs: `[A, A]`: transition probabilities.
         names: A of them.
     """
-    middle = (probs[:, None] + probs[None]) / 2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        parts = np.nan_to_num(probs[:, None] * np.log2(probs[:, None] / middle)).sum(-1)
-    distances = np.sqrt(np.clip((parts + parts.T) / 2, 0, None))
-    np.fill_diagonal(distances, 0)
+    distances = np.sqrt(divergence(probs[:, None], probs))
     figure, (axes,) = panels(1, 1, (WIDTH * 0.75, 0.8 + 0.26 * len(names)))
     tree = linkage(squareform(distances, checks=False), "average")
     labels = [short(name, 24) for name in names]

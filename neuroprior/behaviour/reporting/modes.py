@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from neuroprior._statistics import LEVEL
 from neuroprior.behaviour.analysis.drift import by_position
 from neuroprior.behaviour.analysis.modes import (
     STABLE,
@@ -19,13 +20,14 @@ from neuroprior.behaviour.analysis.modes import (
     mode_transitions,
 )
 from neuroprior.behaviour.analysis.motifs import motifs
+from neuroprior.behaviour.recorded_plans import action_names
 from neuroprior.behaviour.reporting import figures
 from neuroprior.behaviour.reporting.conditions import condition_section
 from neuroprior.behaviour.reporting.document import Column, table
 from neuroprior.behaviour.reporting.findings import Finding
 from neuroprior.behaviour.reporting.fits import counted
 from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
-from neuroprior.behaviour.reporting.part import SIGNIFICANT, Part, action_names, p_text
+from neuroprior.behaviour.reporting.part import Part, p_text
 from neuroprior.behaviour.reporting.scores import Evaluation
 from neuroprior.plans import BLOCKS, Plans, in_parts
 from neuroprior.priors import SwitchingPrior
@@ -161,7 +163,7 @@ def _typical(prior: SwitchingPrior, plans: Plans) -> pd.DataFrame:
     for k in range(prior.num_modes):
         own = every[mode == k]
         found = motifs(own) if len(own) else []
-        over = [one for one in found if one.ratio > 1 and one.corrected < SIGNIFICANT]
+        over = [one for one in found if one.ratio > 1 and one.corrected < LEVEL]
         for one in over[:MOST_MOTIFS]:
             sequence = " ".join(names[action] for action in one.actions)
             rows.append((k + 1, sequence, one.count, one.expected, one.ratio, one.corrected))

@@ -5,16 +5,12 @@ from typing import NamedTuple
 
 import networkx as nx
 import pandas as pd
-from torch import Tensor
 
 from neuroprior.behaviour.reporting.findings import Finding
 from neuroprior.behaviour.reporting.page import Section
-from neuroprior.plans import Plans
 
 LISTED = 12
 """Rows that are shown of a table; its file has all."""
-
-SIGNIFICANT = 0.05
 
 
 class Part(NamedTuple):
@@ -25,16 +21,6 @@ class Part(NamedTuple):
     verdicts: Sequence[str] = ()
     findings: Sequence[Finding] = ()
     graphs: Mapping[str, nx.DiGraph] = {}
-
-
-def action_names(plans: Plans) -> list[str]:
-    """Names of the actions; their numbers where they have none."""
-    return list(plans.action_names or map(str, range(plans.num_actions)))
-
-
-def group_names(plans: Plans, groups: Tensor) -> list[str]:
-    """Names of these groups; their numbers where they have none."""
-    return [plans.group_names[g] if plans.group_names else f"group {g}" for g in groups.tolist()]
 
 
 def p_text(value: float) -> str:

@@ -236,7 +236,7 @@ def _cross_validate(
     with TemporaryDirectory() as temporary:
         run = cross_validation(Path(out or temporary), learned, other, design)
         found, modes = evaluated([]), "" if fits.modes is None else "hidden modes"
-        at_once = [name for name in SECTIONS if name not in OF_MODELS[:2] and name != "modes"]
+        at_once = [name for name in SECTIONS if name not in (*OF_MODELS, "modes")]
         later = ["networks"] * bool(networks) + [modes] * bool(modes)
         yield _Stage(found, at_once, _still("counts", *later))
         for _ in run.each(counts, processes=1, dask=fits.dask, title="counts"):
@@ -248,7 +248,7 @@ def _cross_validate(
             for seconds in run.each(networks, cost=lambda job: COSTS[job.kind], **how):
                 yield _Stage(found, (), _still(f"networks (about {in_words(seconds)} more)", *later[1:]))
             found = evaluated(todo)
-            yield _Stage(found, OF_MODELS, _still(*later[1:]))
+            yield _Stage(found, (*OF_MODELS, *["durations"] * (DURATIONS in inputs)), _still(*later[1:]))
         if modes:
             yield _Stage(found, ("modes",), "")
 

@@ -9,12 +9,12 @@ from neuroprior._statistics import mean_interval
 from neuroprior.behaviour.recordings import KEYS, Recordings
 from neuroprior.behaviour.reporting.document import Column, table
 from neuroprior.behaviour.reporting.drawing import (
-    SPARE,
     WIDTH,
     at_edges,
     band,
     drawn,
     legend,
+    level_colors,
     marker,
     names_down,
     panels,
@@ -36,8 +36,9 @@ def recording_section(found: Evaluation) -> Part | None:
     recordings = found.recordings
     if recordings is None or recordings.events["stop"].isna().all():
         return None
-    frames, budget = {}, time_budget(recordings)
-    frames["time_budget"] = budget
+    each, course = subject_budget(recordings), time_course(recordings)
+    budget = time_budget(each)
+    frames = {"time_budget": budget}
     percent: dict[str, Column] = {
         "behaviour": "behaviour",
         "% of the time": lambda row: f"{100 * row.share:.1f}",
@@ -62,7 +63,6 @@ def recording_section(found: Evaluation) -> Part | None:
         }
         caption = "Cohen's kappa over the time that both watched; models are fitted to the sequences of one observer."
         tables.append(table(agreement[:LISTED], columns, caption, "Agreement of observers"))
-    each, course = subject_budget(recordings), time_course(recordings)
     frames |= {"subject_budget": each, "time_course": course}
     caption = "Share of the watched time that each behaviour takes. Dots: subjects; bars: means with 95 % intervals."
     boxes = [FigureBox(budget_figure(budget, each), caption, "Time budget with a dot for each subject.", "time_budget")]
@@ -126,9 +126,8 @@ def time_course(recordings: Recordings, bins: int = BINS) -> pd.DataFrame:
             for place in range(bins):
                 values = shares[place].dropna().to_numpy()
                 if len(values):
-                    ends = mean_interval(values)[:3] if len(values) > 1 else (float(values[0]), np.nan, np.nan)
                     middle = (edges[place] + edges[place + 1]) / 2
-                    rows.append((level, behaviour, middle, *ends, len(values)))
+                    rows.append((level, behaviour, middle, *_mean(values)))
     return pd.DataFrame(rows, columns=columns)
 
 
@@ -148,7 +147,7 @@ def budget_figure(budget: pd.DataFrame, each: pd.DataFrame) -> Figure:
     levels = list(budget["level"].unique())
     order = list(budget.groupby("behaviour")["share"].max().sort_values().index)
     figure, (axes,) = panels(1, 1, (WIDTH, 0.8 + 0.2 * (1 + len(levels)) * len(order)))
-    hues = dict(zip(levels, (SPARE * len(levels))[: len(levels)], strict=True))
+    hues = level_colors(levels)
     spread = np.linspace(0.28, -0.28, len(levels)) if len(levels) > 1 else np.zeros(1)
     for place, behaviour in enumerate(order):
         for shift, level in zip(spread, levels, strict=True):
@@ -177,7 +176,7 @@ def course_figure(course: pd.DataFrame) -> Figure:
     """
     shown = list(course.groupby("behaviour")["share"].mean().sort_values(ascending=False).index)[:MOST_PANELS]
     levels = list(course["level"].unique())
-    hues = dict(zip(levels, (SPARE * len(levels))[: len(levels)], strict=True))
+    hues = level_colors(levels)
     across = min(len(shown), 3)
     down = -(-len(shown) // across)
     figure, cells = panels(down, across, (WIDTH, 1.7 * down + 0.6), sharex=True)
@@ -195,19 +194,25 @@ def course_figure(course: pd.DataFrame) -> Figure:
     return figure
 
 
-def time_budget(recordings: Recordings) -> pd.DataFrame:
-    """Return the share of the watched time that each behaviour takes, by the levels of the first factor.
+def time_budget(each: pd.DataFrame) -> pd.DataFrame:
+    """Return the share of the watched time that each behaviour takes at each level, from that of each subject.
+
+    Args:
+        each: `level, subject, behaviour, share`, see `subject_budget`.
 
     Returns:
         A frame with the columns `level` ("" without a factor), `behaviour, share, low, high, subjects`: means over
         subjects, with Student's 95 % interval (NaN for a single subject); the longest behaviour of each level first.
     """
-    kept = recordings.of_one_observer()
     rows = []
-    for level, part in kept.by_level(_shown_factor(kept)):
-        shares = part.time_budget()
-        for behaviour in shares.mean().sort_values(ascending=False).index:
-            values = shares[behaviour].dropna().to_numpy()
-            whole = mean_interval(values) if len(values) > 1 else (float(values.mean()), np.nan, np.nan)
-            rows.append((level, behaviour, whole[0], whole[1], whole[2], len(values)))
+    for level, shares in each.groupby("level", sort=False):
+        behaviours = shares.groupby("behaviour")["share"]
+        for behaviour in behaviours.mean().sort_values(ascending=False).index:
+            rows.append((level, behaviour, *_mean(behaviours.get_group(behaviour).to_numpy())))
     return pd.DataFrame(rows, columns=["level", "behaviour", "share", "low", "high", "subjects"])
+
+
+def _mean(shares: NDArray[np.float64]) -> tuple[float, float, float, int]:
+    """Return the mean of shares, its 95 % interval (NaN for a single one), and their number."""
+    bounds = mean_interval(shares)[:3] if len(shares) > 1 else (float(shares[0]), np.nan, np.nan)
+    return *bounds, len(shares)

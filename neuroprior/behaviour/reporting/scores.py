@@ -3,7 +3,7 @@
 import errno
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from math import log
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from torch import Tensor
 from neuroprior._files import written_whole
 from neuroprior._jobs import JobRun
 from neuroprior.behaviour.analysis.comparison import Score, action_bits, score_bits, too_few, unit_name
+from neuroprior.behaviour.analysis.transitions import Transitions, transitions
 from neuroprior.behaviour.durations.past_durations import PastDurations
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.recordings import Recordings
@@ -80,6 +81,11 @@ class Evaluation:
     gains: pd.DataFrame  # the information by lag that models give
     settings: dict[str, Any]  # how it was made
     recordings: Recordings | None = None  # that the plans are fragments of
+
+    @cached_property
+    def transitions(self) -> Transitions:
+        """The transitions of the groups, with their test; the same file gives the same."""
+        return transitions(self.plans, generator=torch.Generator().manual_seed(0))
 
     @property
     def unit(self) -> str:

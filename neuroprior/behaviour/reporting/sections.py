@@ -8,12 +8,12 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from neuroprior._statistics import ENOUGH_UNITS
+from neuroprior._statistics import ENOUGH_UNITS, LEVEL
 from neuroprior.behaviour.analysis.comparison import never_occur, never_taken, too_few, unit_name, units
 from neuroprior.behaviour.analysis.drift import action_drift, by_group, by_plan, by_position
 from neuroprior.behaviour.analysis.lags import mutual_information
 from neuroprior.behaviour.analysis.motifs import motifs
-from neuroprior.behaviour.recorded_plans import RecordedPlans
+from neuroprior.behaviour.recorded_plans import RecordedPlans, action_names, group_names
 from neuroprior.behaviour.reporting import figures
 from neuroprior.behaviour.reporting.conditions import condition_section
 from neuroprior.behaviour.reporting.document import Column, table
@@ -22,15 +22,7 @@ from neuroprior.behaviour.reporting.fits import ACTIONS
 from neuroprior.behaviour.reporting.individuals import individual_section
 from neuroprior.behaviour.reporting.modes import mode_section
 from neuroprior.behaviour.reporting.page import FigureBox, Section
-from neuroprior.behaviour.reporting.part import (
-    LISTED,
-    SIGNIFICANT,
-    Part,
-    action_names,
-    group_names,
-    p_text,
-    without_verdict,
-)
+from neuroprior.behaviour.reporting.part import LISTED, Part, p_text, without_verdict
 from neuroprior.behaviour.reporting.recordings import recording_section
 from neuroprior.behaviour.reporting.scores import Evaluation
 from neuroprior.behaviour.reporting.transitions import transition_section
@@ -197,7 +189,7 @@ def motif_section(found: Evaluation) -> Part | None:
         {"sequence": " ".join(names[action] for action in one.actions)}
         | {key: value for key, value in asdict(one).items() if key != "actions"}
         for one in motifs(plans, top=LISTED)
-        if one.corrected < SIGNIFICANT
+        if one.corrected < LEVEL
     )
     columns: Mapping[str, Column] = {
         "sequence": "sequence",
@@ -327,8 +319,8 @@ SECTIONS: dict[str, Callable[[Evaluation], Part | None]] = {
 """By name, in the order of the page."""
 
 
-OF_MODELS = ("scores", "lags", "durations", "drift")
-"""Sections that say more when networks were fitted."""
+OF_MODELS = ("scores", "lags", "drift")
+"""Sections that say more with each model; durations do where models take these as an input."""
 
 
 def _without_p(columns: Mapping[str, Column], few: str) -> Mapping[str, Column]:

@@ -24,8 +24,7 @@ def transition_section(found: Evaluation) -> Part | None:
     plans = found.plans
     if int(plans.mask().sum(1).max()) < 2:
         return None
-    generator = torch.Generator().manual_seed(0)
-    result, few = transitions(plans, generator=generator), too_few(plans)
+    result, few = found.transitions, too_few(plans)
     names, probs = result.action_names, result.probs()
     frame = result.frame()
     frames = {"transitions": frame, "transition_test": pd.DataFrame()}
@@ -49,7 +48,7 @@ def transition_section(found: Evaluation) -> Part | None:
         )
         boxes.append(FigureBox(transition_graph_figure(result), caption, "Graph of transitions.", "transition_graph"))
     if plans.condition is not None and len(plans.condition.unique()) > 1:
-        levels = transitions(plans, by="condition", generator=generator)
+        levels = transitions(plans, by="condition", generator=torch.Generator().manual_seed(0))
         frames["condition_transitions"] = levels.frame()
         each = levels.group_probs()
         for name, matrix in zip(levels.group_names, each, strict=True):

@@ -33,7 +33,7 @@ def test_what_nobody_watched_does_not_count():
     assert each["m1", "rest"] == pytest.approx(4 / 7)
     assert each["m1", "walk"] == pytest.approx(3 / 7)
     assert each["m2", "walk"] == pytest.approx(7 / 9)
-    budget = time_budget(read(TABLE)).set_index(["level", "behaviour"])["share"]
+    budget = time_budget(subject_budget(read(TABLE))).set_index(["level", "behaviour"])["share"]
     assert budget["saline", "walk"] == pytest.approx((7 / 9 + 1) / 2)
 
 
@@ -53,6 +53,6 @@ def test_behaviours_over_time_are_shares_of_what_was_watched_then():
 
 def test_figures_show_each_subject_and_level():
     recordings = read(TABLE)
-    figure = budget_figure(time_budget(recordings), subject_budget(recordings))
+    figure = budget_figure(time_budget(subject_budget(recordings)), subject_budget(recordings))
     assert sum(len(line.get_xdata()) for line in figure.axes[0].lines if line.get_marker() == "o") >= 5
     assert len([axes for axes in course_figure(time_course(recordings)).axes if axes.get_visible()]) == 3
