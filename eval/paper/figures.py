@@ -140,9 +140,9 @@ def success_against_quality(rows: pd.DataFrame) -> Figure:
     for axes, kind in zip(cells, order, strict=True):
         some = kinds.get_group(kind)
         axes.plot(some.quality, 100 * some.ceiling, color="black", linestyle=":", label="ceiling")
-        for name, color in COLORS.items():
+        for name in filter(some.__contains__, COLORS):
             shares = 100 * some[[name, f"{name} low", f"{name} high"]]
-            band(axes, np.column_stack([some.quality, shares]), color, name, "-")
+            band(axes, np.column_stack([some.quality, shares]), COLORS[name], name, "-")
         axes.set_title({"sweeps": "value iteration cut short"}.get(kind, kind), fontsize=10)
         axes.set_xlabel("quality of the values")
         axes.spines[["top", "right"]].set_visible(False)

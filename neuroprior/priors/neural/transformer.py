@@ -19,6 +19,10 @@ FEWEST_AT_ONCE = 32
 """Inputs of a sequence that are read at once, at least, past the training length."""
 
 
+Rotation = tuple[Tensor, Tensor]
+"""Cosine and sine, see `rotation`."""
+
+
 class TransformerPrior(NeuralPrior):
     """A pre-norm transformer (Vaswani et al. 2017) with rotary positions (Su et al. 2021) as a prior.
 
@@ -112,9 +116,11 @@ class TransformerPrior(NeuralPrior):
         x, recent = self.embedding(previous, context, recent, self.window)
         x = self.drop(x)
         place = number[:, None] + torch.arange(previous.shape[1], device=previous.device)
+        turns = rotation(place, self.width // self.num_heads)
+        near = None if self.window is None else rotation(place.clamp(max=self.window), self.width // self.num_heads)
         caches = []
         for past, block in zip(pasts, self.blocks, strict=True):
-            x, cache = block(x, past, place, self.span, self.window)
+            x, cache = block(x, past, turns, near, self.span, self.window)
             caches.append(cache)
         return self.head(self.norm(x)), (tuple(caches), place[:, -1] + 1, recent)
 
@@ -150,36 +156,36 @@ class Block(nn.Module):
         )
 
     def forward(
-        self, x: Tensor, past: Tensor | None, place: Tensor, span: int | None, window: int | None = None
+        self,
+        x: Tensor,
+        past: Tensor | None,
+        turns: Rotation,
+        near: Rotation | None = None,
+        span: int | None = None,
+        window: int | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """`x [N, T, width]` at steps `place [N, T]` after `past [N, S, 2 * width]`: the new `x`, and what is kept.
+        """`x [N, T, width]` after `past [N, S, 2 * width]`: the new `x`, and what is kept.
 
-        Each step attends to itself and those before it, at most `span` back. With a `window`, each attends to the
-        first one and to the last `window`, itself among them; the first is never further away than `window`, and is
-        kept.
+        Each step, rotated by `turns`, attends to itself and those before it, at most `span` back. With a `window`, each
+        attends to the first one, rotated by `near`, and to the last `window`, itself among them; the first is never
+        further away than `window`, and is kept.
         """
-        size = x.shape[-1] // self.num_heads
-        unturned, key, value = self._project(x)
-        turns = rotation(place, size)
-        query, kept = rotate(unturned, *turns), torch.cat([rotate(key, *turns), value], -1)
+        width = x.shape[-1]
+        unturned, value = self.query_key_value(self.attention_norm(x)).split([2 * width, width], -1)
+        query, key = rotate(unturned, *turns).chunk(2, -1)
+        kept = torch.cat([key, value], -1)
         if past is not None:
             kept = torch.cat([past.to(kept.dtype), kept], 1)  # under autocast the new ones may be of another dtype
         key, value = kept.chunk(2, -1)
-        if window is None or key.shape[1] <= window + 1:
+        if window is None or near is None or key.shape[1] <= window + 1:
             mixed = self._attend(query, key, value, span)
         else:
-            near = rotate(unturned, *rotation(place.clamp(max=window), size))
-            mixed = self._attend_to_first(query, near, key, value, window)
+            mixed = self._attend_to_first(query, rotate(unturned[..., :width], *near), key, value, window)
         most = span if window is None else window + 1
         if most is not None and kept.shape[1] > most:
             first = 0 if window is None else 1
             kept = torch.cat([kept[:, :first], kept[:, first - most :]], 1)
         return self._add(x, mixed), kept
-
-    def _project(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Queries, keys and values of `x [N, T, width]`."""
-        query, key, value = self.query_key_value(self.attention_norm(x)).chunk(3, -1)
-        return query, key, value
 
     def _add(self, x: Tensor, mixed: Tensor) -> Tensor:
         """`x` plus the output of attention, `mixed`, and then plus that of the two-layer network."""
@@ -225,7 +231,7 @@ def reached(num: int, total: int, span: int, device: torch.device) -> Tensor:
     return (back >= 0) & (back <= span)
 
 
-def rotation(place: Tensor, size: int) -> tuple[Tensor, Tensor]:
+def rotation(place: Tensor, size: int) -> Rotation:
     """Cosine and sine `[N, T, size / 2]` of the angles by which heads of this size are rotated at `place [N, T]`."""
     half = size // 2
     angle = place[..., None] * 10_000 ** -(torch.arange(half, device=place.device) / half)
