@@ -14,6 +14,14 @@ from neuroprior._checks import is_number
 from neuroprior.plans.columns import as_single, check_names, listed, padded
 from neuroprior.plans.plans import Plans, as_integers, as_numbers, check_numbered, check_shape, check_texts
 
+CONTROLS = frozenset(
+    (
+        *("control", "controls", "ctrl", "ctl", "vehicle", "veh", "saline", "placebo", "sham", "untreated", "naive"),
+        *("baseline", "wt", "wildtype", "wild type", "wild-type", "+/+"),
+    )
+)
+"""Names of the level of a factor that others are compared with, in lower case."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RecordedPlans(Plans):
@@ -286,11 +294,15 @@ def _design_fields(
     """
     several = [name for name in factors if first[name].nunique() > 1]
     factor = compare or (several or list(factors))[0]
-    levels = sorted(pd.unique(first[factor]), key=lambda level: (level != reference, str(level)))
+    levels = sorted(pd.unique(first[factor]), key=str)
     if "" in levels:
         raise ValueError(f"`compare` must be known for each recording, got empty cells of {factor!r}")
     if reference is not None and reference not in levels:
         raise ValueError(f"`reference` must be one of {', '.join(levels)}, got {reference!r}")
+    controls = [level for level in levels if str(level).casefold() in CONTROLS]
+    if reference is None and len(controls) == 1:
+        reference = controls[0]
+    levels.sort(key=lambda level: level != reference)
     codes = pd.Index(levels).get_indexer(pd.Index(first[factor])).astype(np.int64)
     fields: dict[str, Any] = {"condition": torch.from_numpy(codes), "condition_names": tuple(map(str, levels))}
     if factor in (strata or ()):

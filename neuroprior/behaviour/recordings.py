@@ -272,7 +272,8 @@ class Recordings:
         Args:
             max_gap: a longer pause ends a plan as well; in the unit of the recordings.
             compare: the factor that is compared; None: the first that has two levels.
-            reference: its level that others are compared with, such as "saline"; None: the first by name.
+            reference: its level that others are compared with; None: the only one with a control's name, such as
+                "saline" or "wild type", else the first by name.
             strata: factors, such as sex, within whose levels it is compared; None: the others, but for those that vary
                 within a subject, and those with a level in which nothing can be compared.
             num_actions: A, where behaviours are numbers; None: the largest + 1.

@@ -48,18 +48,14 @@ def score(
     plans, notes = with_contexts_of(prior, plans, tabular)
     own, past = match_plans(plans, prior, folder), PastDurations.load(Path(folder))
     own = own if past is None else past.added_to(own)
-    for path in (place / f"{by}s.csv" for by in UNITS if by == "plan" or getattr(plans, by) is not None):
+    units = [by for by in UNITS if by == "plan" or getattr(plans, by) is not None]
+    for path in (place / f"{by}s.csv" for by in units):
         if path.exists() and not _is_of_scores(path):
             raise ValueError(f"out: {path} is there, and holds no scores; give another folder")
     bits = action_bits(prior, own)
     whole = score_bits(folder, "", bits, own).bits_per_action()
-    scores = scores_by(bits, plans, "plan")
     learned = learned_from(Path(folder), plans)
-    scores.insert(1, "training_data", learned)
-    frames = {"plans": scores}
-    for by in UNITS[1:]:
-        if getattr(plans, by) is not None:
-            frames[f"{by}s"] = scores_by(bits, plans, by)
+    frames = {f"{by}s": scores_by(bits, plans, by, learned) for by in units}
     name = "groups" if "groups" in frames else "plans"
     frame = frames[name]
     first = {name[:-1]: name[:-1]} | ({"plans": "plans:,"} if name == "groups" else {})

@@ -4,6 +4,7 @@
 """
 
 import hashlib
+import os
 from math import log
 from pathlib import Path
 from typing import Any
@@ -15,16 +16,17 @@ from neuroprior._files import read_json, write_json
 from neuroprior.plans import Plans
 from neuroprior.priors.matching import match_plans
 from neuroprior.priors.prior import Prior
+from neuroprior.priors.serialization import load
 
 LEARNED = "learned.json"
 """In the folder of a saved prior: the digests of the plans that it has learned from, at least in part."""
 
 
-def score(prior: Prior, plans: Plans, by: str = "plan") -> Any:
+def score(prior: Prior | str | os.PathLike[str], plans: Plans, by: str = "plan") -> Any:
     """The log-likelihood of plans under a prior, summed by plan, by action, or by group.
 
     Args:
-        prior: fitted.
+        prior: fitted; or the folder of a saved one, which knows the plans that it has learned from.
         plans: N of them; their actions and contexts are matched by name, where both have names (not in plans with the
             end symbol of the prior, see `match_plans`).
         by: what a row is: "plan", "action", "group", or what else a subclass of `Plans` has for each plan, such as
@@ -33,7 +35,8 @@ def score(prior: Prior, plans: Plans, by: str = "plan") -> Any:
     Returns:
         A pandas frame: `by`; `plans` and `actions`, how many (of a plan `actions` alone, its number, and its `group`
         and whatever else it has one of); `log_likelihood`, nats; `bits_per_action`. The likelihood of a plan's end,
-        where the prior predicts it, counts for the plan, not for an action.
+        where the prior predicts it, counts for the plan, not for an action. With a folder, `training_data` says which
+        plans the prior has learned from, at least in part (of a group: how many): their bits are too low.
 
     Raises:
         ValueError: the prior does not know the actions or contexts, or plans have no groups.
@@ -43,6 +46,9 @@ def score(prior: Prior, plans: Plans, by: str = "plan") -> Any:
         >>> score(UniformPrior(3), plans, by="group")["bits_per_action"].round(3).tolist()
         [1.585, 1.585]
     """
+    folder = None if isinstance(prior, Prior) else prior
+    if isinstance(prior, str | os.PathLike):
+        prior = load(prior)
     if not isinstance(prior, Prior):
         raise ValueError(
             "`prior` must be a fitted prior of numbered actions (neuroprior.load gives that of a folder), got"
@@ -50,11 +56,16 @@ def score(prior: Prior, plans: Plans, by: str = "plan") -> Any:
         )
     with torch.no_grad():
         log_probs = prior.action_log_probs(match_plans(plans, prior))
-    return scores_by(-log_probs.cpu().double() / log(2), plans if plans.end is None else plans.without_end(), by)
+    plans = plans if plans.end is None else plans.without_end()
+    learned = None if folder is None else learned_from(Path(folder), plans)
+    return scores_by(-log_probs.cpu().double() / log(2), plans, by, learned)
 
 
-def scores_by(bits: Tensor, plans: Plans, by: str) -> Any:
-    """The frame of `score` from the bits `[N, L]`, or `[N, L + 1]` with those of a plan's end, of each action."""
+def scores_by(bits: Tensor, plans: Plans, by: str, learned: list[bool] | None = None) -> Any:
+    """The frame of `score` from the bits `[N, L]`, or `[N, L + 1]` with those of a plan's end, of each action.
+
+    `learned` says which of the N plans the prior has learned from.
+    """
     import pandas as pd
 
     units = ("plan", "action", *_units_of(plans))
@@ -70,10 +81,12 @@ def scores_by(bits: Tensor, plans: Plans, by: str) -> Any:
         found = frame.agg(plans=("plan", "nunique"), actions=("plan", "size"), bits=("bits", "sum")).reset_index()
         found["action"] = [names[action] for action in found["action"]]
     else:
-        found = plan_frame(plans).assign(actions=mask.sum(1).tolist(), bits=bits.sum(1).tolist())
+        numbers = {"training_data": learned} if learned is not None else {}
+        numbers |= {"actions": mask.sum(1).tolist(), "bits": bits.sum(1).tolist()}
+        found = plan_frame(plans).assign(**numbers)
         if by != "plan":
             sums = found.groupby(by, sort=False, as_index=False)
-            found = sums.agg(plans=("plan", "size"), actions=("actions", "sum"), bits=("bits", "sum"))
+            found = sums.agg(plans=("plan", "size"), **{name: (name, "sum") for name in numbers})
     found["log_likelihood"] = -log(2) * found["bits"]
     found["bits_per_action"] = found["bits"] / found["actions"].where(found["actions"] > 0)
     return found.drop(columns="bits")

@@ -191,7 +191,22 @@ def test_factors_that_would_leave_nothing_to_compare_are_no_strata():
         in plans.notes
     )
     assert plans_by(rows, strata="sex").stratum.tolist() == [0, 1, 0]
-    assert plans_by(rows, ["day", "treatment"]).condition_names == ("drug", "saline")
+    assert plans_by(rows, ["day", "treatment"]).condition_names == ("saline", "drug")
+
+
+@pytest.mark.parametrize(
+    ("levels", "ordered"),
+    [
+        (("high", "low", "Vehicle"), ("Vehicle", "high", "low")),
+        (("KO", "WT", "het"), ("WT", "KO", "het")),
+        (("drug", "saline", "sham"), ("drug", "saline", "sham")),
+        (("drug", "saline solution", "uncontrolled"), ("drug", "saline solution", "uncontrolled")),
+    ],
+)
+def test_the_only_level_with_the_name_of_a_control_is_the_reference(levels, ordered):
+    rows = [(f"m{number}", levels[number % 3], "f", "1") for number in range(6)]
+    assert plans_by(rows, ["treatment"]).condition_names == ordered
+    assert plans_by(rows, ["treatment"], reference=levels[0]).condition_names[0] == levels[0]
 
 
 @pytest.mark.parametrize(

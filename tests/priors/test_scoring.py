@@ -5,7 +5,7 @@ from math import log
 import pytest
 import torch
 
-from neuroprior import MarkovPrior, Plans, UniformPrior
+from neuroprior import MarkovPrior, Plans, UniformPrior, save
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.priors import match_plans
 from neuroprior.priors.scoring import keep_learned, learned_from, score
@@ -101,6 +101,20 @@ def test_plans_that_were_learned_from_are_known_again(tmp_path):
     nothing = Plans(TRAINING.actions[:2], 3, torch.tensor([0, 6]), action_names=NAMES)
     keep_learned(tmp_path, nothing)
     assert learned_from(tmp_path, nothing) == [False, True]
+
+
+def test_scores_of_a_saved_prior_say_what_it_has_learned_from(tmp_path):
+    save(PRIOR, tmp_path)
+    keep_learned(tmp_path, TRAINING[3:10])
+    plans = Plans(TRAINING.actions, 3, action_names=NAMES, group=torch.arange(40) % 7 % 3)
+    by_plan, by_group, by_action = (score(tmp_path, plans, by) for by in ("plan", "group", "action"))
+    known = learned_from(tmp_path, plans)
+    assert by_plan["training_data"].tolist() == known
+    assert 7 <= sum(known) < 40
+    counted = by_plan.groupby("group", sort=False)["training_data"].sum()
+    assert by_group["training_data"].tolist() == counted.tolist()
+    for one, by in ((by_plan, "plan"), (by_group, "group"), (by_action, "action")):
+        assert one.drop(columns="training_data", errors="ignore").equals(score(PRIOR, plans, by))
 
 
 @pytest.mark.parametrize("content", ["[]", '{"plans": 5}', '{"plans": [5]}', "{}", "{"])

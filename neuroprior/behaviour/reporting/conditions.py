@@ -218,9 +218,9 @@ def _test_table(result: ConditionComparison, tests: pd.DataFrame) -> Table:
     assert prediction is not None
     mean, low, high, _ = prediction.gain
     caption = (
-        f"Smallest possible p: {result.smallest_p:.2g}; corrected for {len(result.tests)} tests:"
-        f" {min(len(result.tests) * result.smallest_p, 1):.2g}. *: p < 0.05, corrected. A Markov chain that knows the"
-        f" condition saves {mean:+.4f} bits per held-out action (95 % interval {low:+.4f} to {high:+.4f} over"
+        f"Smallest possible p: {result.smallest_p:.2g}. *: p < 0.05, corrected for the {len(result.tests)} tests (the"
+        " smallest p of all in each labelling: Westfall and Young). A Markov chain that knows the condition saves"
+        f" {mean:+.4f} bits per held-out action (95 % interval {low:+.4f} to {high:+.4f} over"
         f" {result.design.item}; the test asks whether other labellings save as much, not whether this is above 0)."
     )
     return table(tests, columns, caption, "Do conditions differ?")

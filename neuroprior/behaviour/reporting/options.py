@@ -41,7 +41,8 @@ class ReadOptions(Options):
         day_first, words, merge_repeats, from_, to, drop, rename: see there.
         max_gap: a longer pause between two behaviours ends a plan, too; in the unit of the times.
         compare: the factor that is compared, such as the treatment; the first where none is named.
-        reference: its level that the others are compared with, such as vehicle.
+        reference: its level that the others are compared with; by default the one that is called control, vehicle,
+            saline, placebo, sham, untreated, naive, baseline or wild type, if there is one, else the first by name.
         strata: factors, such as sex, within whose levels it is compared; by default the others, but for those that vary
             within a subject. None after the option: not within any.
         num_actions: number of actions, where they are numbers and the file does not say.

@@ -70,7 +70,7 @@ def test_stars_and_limits_of_the_printed_tables():
     tests, features, predicted = section.tables
     assert tests.rows[0][0] == "all tests together"
     assert all(row[-1].endswith("*") == (float(row[-1].strip("*")) < 0.05) for row in tests.rows[1:])
-    assert "Smallest possible p: 0.0022; corrected for 6 tests: 0.013." in tests.caption
+    assert "Smallest possible p: 0.0022. *: p < 0.05, corrected for the 6 tests" in tests.caption
     assert len(features.rows) == LISTED < len(frames["conditions"])
     starred = [row[0] for row in features.rows if row[-1].endswith("*")]
     assert starred == frames["conditions"]["feature"][frames["conditions"]["significant"]].tolist()[:LISTED]
