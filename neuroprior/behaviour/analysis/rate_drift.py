@@ -7,8 +7,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy import special
 
-from neuroprior._statistics import Difference, holm, ratio_difference
+from neuroprior._statistics import Difference, holm
 from neuroprior.behaviour.recordings import KEYS, Recordings
 from neuroprior.plans.folds import FEWEST_UNITS
 from neuroprior.plans.plans import Plans, check_are_plans
@@ -84,8 +85,8 @@ def rate_drift(source: Recordings | Plans, per: Literal["bouts", "time"] = "bout
 
     The logarithm of the rate is a line in the relative time of the session, with a slope that all sessions share and a
     level of each. Given how many bouts a session has, their times do not depend on its level: the slope is the maximum
-    of that likelihood. Its error is that of sums over units (`neuroprior.behaviour.ratio_difference`): it holds however
-    bouts of a subject depend on one another. Units are subjects, or recordings where there are not two subjects.
+    of that likelihood. Its error is that of the units' scores: it holds however bouts of a subject depend on one
+    another. Units are subjects, or recordings where there are not two subjects.
 
     Rates by time vary more: whatever takes long changes those of all behaviours. Where watching is only known from the
     bouts, a fragment is watched between its first and last start, which do not count: rates would be too high.
@@ -118,10 +119,10 @@ def rate_drift(source: Recordings | Plans, per: Literal["bouts", "time"] = "bout
     bouts = counts.bouts * (counts.watched[:, None] > 0)  # at the only moment of a fragment there is no rate
     slope, score, information = _fit_slopes(bouts, counts.watched)
     unit_of = np.unique(counts.unit, return_inverse=True)[1]
-    totals, sizes = np.zeros((2, number, len(slope)))
-    np.add.at(totals, unit_of, score + slope * information)
+    scores, sizes = np.zeros((2, number, len(slope)))
+    np.add.at(scores, unit_of, score)
     np.add.at(sizes, unit_of, information)
-    changes = [_change(*one) for one in zip(slope, totals.T, sizes.T, strict=True)]
+    changes = [_change(*one) for one in zip(slope, scores.T, sizes.T, strict=True)]
     corrected = holm([one.p_value for one in changes])
     number_of = bouts.sum((0, 2)).astype(np.int64)
     return RateDrift(tuple(counts.names), number_of, changes, corrected, unit, number)
@@ -197,8 +198,19 @@ def _fit_slopes(bouts: Array, watched: Array) -> tuple[Array, Array, Array]:
     return slope, score, information
 
 
-def _change(slope: float, totals: Array, sizes: Array) -> Difference:
-    informed = sizes > 1e-9
-    if informed.sum() < FEWEST_UNITS or abs(slope) >= MAX_CHANGE:
+def _change(slope: float, scores: Array, information: Array) -> Difference:
+    """Return a slope with its interval, from each unit's score and information `[G]`.
+
+    The error leaves out a unit at a time, to first order; the degrees of freedom are those of units that inform so
+    unequally.
+    """
+    informed = information > 1e-9
+    if (number := int(informed.sum())) < FEWEST_UNITS or abs(slope) >= MAX_CHANGE:
         return Difference(float(slope), -np.inf, np.inf, 1.0)
-    return ratio_difference(totals[informed], sizes[informed])
+    total = information[informed].sum()
+    share = information[informed] / total
+    error = float(np.sqrt((number - 1) / number * ((scores[informed] / (1 - share)) ** 2).sum()) / total)
+    freedom = max(1 / float((share**2).sum()) - 1, 1.0)
+    half = float(special.stdtrit(freedom, 0.975)) * error
+    p_value = float(2 * special.stdtr(freedom, -abs(slope) / error)) if error > 1e-9 else 2.0 ** (1 - number)
+    return Difference(float(slope), float(slope) - half, float(slope) + half, p_value)

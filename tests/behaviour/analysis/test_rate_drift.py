@@ -29,10 +29,12 @@ def simulated(seed, slope=0.0, subjects=12, gaps=False, shares=False):
     session, span = np.arange(len(subject)), random.uniform(200, 900, len(subject))
     number = random.poisson(random.uniform(60, 150, len(subject)))
     of, place = np.repeat(session, number), random.random(number.sum())
+    ends = [np.array([end(place[of == one]) for one in session])[of] for end in (np.min, np.max)]
+    place = (place - ends[0]) / (ends[1] - ends[0])  # sessions are what lies between the first and the last bout
     level = random.uniform(0.2, 0.5, subjects)[subject]
     chance = level[of] * np.exp(slope * place)
     run, other = random.random(len(of)) < chance, random.choice(["dig", "eat"], len(of), p=[0.3, 0.7])
-    kept = np.ones(len(of), bool) if shares else run | (random.random(len(of)) < 0.5)
+    kept = np.ones(len(of), bool) if shares else run | (random.random(len(of)) < 0.5) | (place % 1 == 0)
     fragment = of * 2
     if gaps:
         begin = random.uniform(0.05, 0.35, len(subject)) + 0.4 * (subject % 2)
@@ -90,7 +92,7 @@ def test_slopes_are_the_maximum_of_the_likelihood(per):
     assert found.bouts[at] == counts.sum()
     assert found.corrected == pytest.approx(holm([one.p_value for one in found.changes]))
     assert (found.unit, found.num_units) == ("subjects", 5)
-    assert "run" in repr(found)
+    assert str(found.frame()["behaviour"].iloc[0]) in repr(found)
 
 
 def test_the_frame_has_factors_and_the_clearest_change_first():
