@@ -34,11 +34,9 @@ if TYPE_CHECKING:
         compare_conditions,
     )
     from neuroprior.behaviour.analysis.drift import (
-        ActionDrift,
         GroupDrift,
         PlanDrift,
         PositionDrift,
-        action_drift,
         by_group,
         by_plan,
         by_position,
@@ -49,6 +47,7 @@ if TYPE_CHECKING:
     from neuroprior.behaviour.analysis.modes import ModeChoice, choose_modes, mode_frame, mode_plans, mode_table
     from neuroprior.behaviour.analysis.motifs import Motif, motifs
     from neuroprior.behaviour.analysis.permutation_design import PermutationDesign
+    from neuroprior.behaviour.analysis.rate_drift import RateDrift, rate_drift
     from neuroprior.behaviour.analysis.transitions import Transitions, transitions
     from neuroprior.behaviour.durations.duration_model import DurationLaw, DurationModel
     from neuroprior.behaviour.durations.laws import LAW_NAMES, LawName
@@ -61,7 +60,6 @@ if TYPE_CHECKING:
     from neuroprior.behaviour.study import large_study, simulated_study
 
 __all__ = [
-    "ActionDrift",
     "Baseline",
     "Columns",
     "ConditionComparison",
@@ -86,6 +84,7 @@ __all__ = [
     "PermutationDesign",
     "PlanDrift",
     "PositionDrift",
+    "RateDrift",
     "ReadOptions",
     "ReadingError",
     "RecordedPlans",
@@ -95,7 +94,6 @@ __all__ = [
     "Transitions",
     "Types",
     "action_bits",
-    "action_drift",
     "baselines",
     "by_group",
     "by_plan",
@@ -113,6 +111,7 @@ __all__ = [
     "motifs",
     "mutual_information",
     "paired_difference",
+    "rate_drift",
     "ratio_difference",
     "read",
     "report",
@@ -138,6 +137,7 @@ _ROOMS = (
     "neuroprior.behaviour.analysis.modes",
     "neuroprior.behaviour.analysis.motifs",
     "neuroprior.behaviour.analysis.permutation_design",
+    "neuroprior.behaviour.analysis.rate_drift",
     "neuroprior.behaviour.analysis.transitions",
     "neuroprior.behaviour.durations.duration_model",
     "neuroprior.behaviour.durations.laws",

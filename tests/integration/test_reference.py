@@ -67,7 +67,6 @@ WITHOUT_EXAMPLE = {
     },
     "results, which the functions that return them show": {
         *(
-            "ActionDrift",
             "Baseline",
             "Batch",
             "Comparison",
@@ -98,7 +97,7 @@ WITHOUT_EXAMPLE = {
             "Motif",
         ),
         *("PermutationDesign", "PlanDrift", "PositionDrift", "Posterior", "Rollout", "Row", "Score", "Search"),
-        *("Sizes", "Steps", "Sweep", "TooLargeError", "Transitions", "Tuned", "Types", "VectorDecision"),
+        *("RateDrift", "Sizes", "Steps", "Sweep", "TooLargeError", "Transitions", "Tuned", "Types", "VectorDecision"),
     },
     "made by a function that has one": {"PocketCube", "SlidingTilesWorld", "SimulatorWorld", "SokobanWorld"},
     "of packages or data that not everybody has": {"from_mujoco", "read_minari", "write_minari"},

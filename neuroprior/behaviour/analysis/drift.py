@@ -1,9 +1,9 @@
-"""Drift: how surprisal and actions change within plans, from plan to plan of a group, and between groups.
+"""Drift of surprisal: how it changes within plans, from plan to plan of a group, and between groups.
 
 The surprisal of an action is its negative log2-probability under a prior, in bits.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from itertools import permutations
 from math import nan
@@ -15,11 +15,11 @@ from scipy import special, stats
 from torch import Tensor
 
 from neuroprior._checks import check_sizes
-from neuroprior._statistics import Difference, Interval, holm, ratio_difference
+from neuroprior._statistics import Difference, Interval, ratio_difference
 from neuroprior.behaviour.analysis.comparison import units
 from neuroprior.behaviour.recorded_plans import RecordedPlans, join_fragments
 from neuroprior.plans import Plans
-from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
+from neuroprior.plans.folds import FEWEST_UNITS
 from neuroprior.plans.plans import check_are_plans
 
 FEWEST_RANKED = 3
@@ -89,24 +89,6 @@ class GroupDrift:
 
     groups: dict[int, Interval]
     p_value: float | None
-
-
-@dataclass(frozen=True)
-class ActionDrift:
-    """How often an action is taken in the first and in the second half of plans.
-
-    Attributes:
-        action: its number.
-        first, second: its share of all actions in either half.
-        change: `second - first`, with its 95 % interval over units and the p-value of 0.
-        corrected: that p-value, corrected for the number of actions (`neuroprior.behaviour.holm`).
-    """
-
-    action: int
-    first: float
-    second: float
-    change: Difference
-    corrected: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,54 +199,6 @@ def by_group(plans: Plans, bits: Tensor, mask: Tensor) -> GroupDrift:
         return GroupDrift(found, 1.0)
     ends = np.cumsum([len(part) for part in several])[:-1]
     return GroupDrift(found, float(stats.kruskal(*np.split(together, ends)).pvalue))
-
-
-def action_drift(plans: Plans) -> list[ActionDrift]:
-    """How the share of each action changes from the first half of plans to the second.
-
-    The central action of a plan of odd length is left out, so that halves have equal sizes; the difference is paired by
-    unit. Units are the groups, or the plans if fewer than two groups have any; of a single plan each half is cut into
-    `BLOCKS` / 2 parts, and the first part of one half is paired with the first part of the other.
-
-    Args:
-        plans: the plans.
-
-    Returns:
-        One for each action, in ascending order.
-
-    Raises:
-        ValueError: fewer than two units: no two plans of at least two actions, and no single one of at least four.
-
-    Example:
-        >>> plans = Plans(torch.randint(2, (8, 20), generator=torch.Generator().manual_seed(0)), 2)
-        >>> [found.action for found in action_drift(plans)]
-        [0, 1]
-    """
-    check_are_plans(plans)
-    plans = join_fragments(plans)[0]
-    length, step = plans.mask().sum(1)[:, None], torch.arange(plans.max_length, device=plans.actions.device)
-    half = length // 2
-    late = step >= length - half
-    mask = (step < half) | (late & (step < length))
-    whole = units(plans, mask)[mask]
-    if int(mask.any(1).sum()) == 1:
-        within = torch.where(late, step - (length - half), step)
-        whole = (within * (BLOCKS // 2)).div(half.clamp(min=1), rounding_mode="floor")[mask]
-    unit = whole.unique(return_inverse=True)[1]
-    num = int(unit.max()) + 1 if len(unit) else 0
-    if num < FEWEST_UNITS:
-        raise ValueError("`plans` must be two of at least two actions, or a single one of at least four.")
-    actions, sign = plans.actions[mask], torch.where(late.expand(mask.shape)[mask], 1.0, -1.0).double()
-    sizes = unit.bincount().double() / 2
-    found = []
-    for action in range(plans.num_actions):
-        taken = actions == action
-        change = _sums(sign[taken], unit[taken], num)
-        second = float((sign[taken] > 0).sum()) / float(sizes.sum())
-        difference = ratio_difference(change, sizes)
-        found.append(ActionDrift(action, second - difference.mean, second, difference, difference.p_value))
-    corrected = holm([one.change.p_value for one in found])
-    return [replace(one, corrected=float(p)) for one, p in zip(found, corrected, strict=True)]
 
 
 def _joined(plans: Plans, bits: Tensor, mask: Tensor) -> tuple[Plans, Tensor, Tensor]:

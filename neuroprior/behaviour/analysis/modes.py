@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from math import inf
 from operator import le
 from typing import Any
 
@@ -26,6 +27,9 @@ from neuroprior.priors.scoring import plan_frame
 
 STABLE = 0.7
 """The least correlation at which a mode counts as found again in another fold."""
+
+MIN_ENDS = 1e-6
+"""Expected ends of a mode below which none is expected."""
 
 FOLDS = 5
 """The most folds on which the number of modes is chosen."""
@@ -289,8 +293,8 @@ def mode_frame(prior: SwitchingPrior, plans: Plans) -> Any:
 def mode_table(prior: SwitchingPrior, plans: Plans) -> Any:
     """What each mode does, as a pandas frame with a row a mode.
 
-    `mode`; `share` of the actions, by the smoothed posterior; `dwell`, mean actions from its beginning to its end in
-    the most probable path (those that the end of a plan cuts off left out, where there are others); `visits` a plan;
+    `mode`; `share` of the actions, by the smoothed posterior; `dwell`, the expected actions in it, with a next one, for
+    each expected end of it (infinite where none is expected); `visits`, expected in a plan;
     `actions`, up to three that it takes more often than all modes together, by the difference (of a single mode, the
     most frequent), with their shares in the mode; `enters` and `leaves`, the three contexts in which the path most
     often changes to it and from it, where contexts are indices.
@@ -327,14 +331,17 @@ def mode_table(prior: SwitchingPrior, plans: Plans) -> Any:
     if context is not None and varies and "num_contexts" in context_arguments(plans):
         places = plans.context_names or tuple(map(str, range(int(context.max()) + 1)))
     rows = []
-    for k, dwell in enumerate(_runs(path, mask, prior.num_modes)):
+    moves = found.moves.cpu().sum(0)
+    leaves, enters = (moves.sum(by) - moves.diagonal() for by in (1, 0))
+    begun = found.smoothed.cpu()[:, :1][mask[:, :1]].sum(0)
+    for k in range(prior.num_modes):
         own = taken[k] / taken[k].sum().clamp(min=1e-12)
         most = (own - overall).argsort(descending=True, stable=True)[:3].tolist()
         row: dict[str, Any] = {
             "mode": k + 1,
             "share": float(weights[:, k].mean()),
-            "dwell": dwell,
-            "visits": float((((path == k) & mask)[:, :1].sum() + (changed & (path[:, 1:] == k)).sum()) / len(plans)),
+            "dwell": float(moves[k].sum() / leaves[k]) if leaves[k] > MIN_ENDS else inf,
+            "visits": float((begun[k] + enters[k]) / len(plans)),
             "actions": ", ".join(f"{names[a]} {own[a]:.2f}" for a in most if own[a] > overall[a]),
         }
         if places is not None and context is not None:
@@ -344,21 +351,3 @@ def mode_table(prior: SwitchingPrior, plans: Plans) -> Any:
                 row[what] = ", ".join(f"{places[c]} {where[c] / where.sum():.2f}" for c in top if where[c])
         rows.append(row)
     return pd.DataFrame(rows)
-
-
-def _runs(path: Tensor, mask: Tensor, number: int) -> list[float]:
-    """The mean length of the runs of each mode; of whole ones, where there are any."""
-    begins = torch.cat([mask[:, :1], (path[:, 1:] != path[:, :-1]) & mask[:, 1:]], 1)
-    where = begins.nonzero()
-    ends = mask.sum(1)[where[:, 0]]
-    after = torch.cat([where[1:], where.new_tensor([[-1, 0]])])
-    same = after[:, 0] == where[:, 0]
-    stop = torch.where(same, after[:, 1], ends)
-    size, modes = (stop - where[:, 1]).double(), path[begins]
-    means = []
-    for k in range(number):
-        own = modes == k
-        whole = own & same
-        some = whole if bool(whole.any()) else own
-        means.append(float(size[some].mean()) if bool(some.any()) else float("nan"))
-    return means

@@ -75,8 +75,8 @@ def mode_section(found: Evaluation) -> Part | None:
     }
     columns |= {side: side for side in ("enters", "leaves") if side in described}
     caption = (
-        "%: of the actions. dwell: mean actions until the mode ends. visits: a plan. actions: those that it takes"
-        " more often than all modes together, with their shares in the mode."
+        "%: of the actions. dwell: actions in the mode for each end of it, visits: of a plan, both expected."
+        " actions: those that it takes more often than all modes together, with their shares in the mode."
         + " enters, leaves: the commonest contexts."
         * ("enters" in described)
     )

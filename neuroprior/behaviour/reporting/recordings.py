@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from neuroprior._statistics import mean_interval
+from neuroprior.behaviour.analysis.rate_drift import overlap
 from neuroprior.behaviour.recordings import KEYS, Recordings
 from neuroprior.behaviour.reporting.document import Column, table
 from neuroprior.behaviour.reporting.drawing import (
@@ -109,9 +110,8 @@ def time_course(recordings: Recordings, bins: int = BINS) -> pd.DataFrame:
 
     def inside(frame: pd.DataFrame) -> NDArray[np.float64]:
         """Return how much of each row lies in each part `[rows, bins]`."""
-        low, high = ((frame[end] - frame["begin"]).to_numpy()[:, None] for end in ("start", "stop"))
-        taken = np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1])
-        return np.asarray(np.nan_to_num(np.clip(taken, 0, None)))
+        start, stop = ((frame[end] - frame["begin"]).to_numpy(np.float64) for end in ("start", "stop"))
+        return overlap(start, stop, edges)
 
     factor = _shown_factor(kept)
     events = events.assign(level=events[factor] if factor else "")

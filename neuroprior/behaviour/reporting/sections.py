@@ -1,6 +1,7 @@
 """The sections of a report on plans: each makes its tables, as pandas frames and as text, and its figures."""
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
 
@@ -10,18 +11,20 @@ from torch import Tensor
 
 from neuroprior._statistics import ENOUGH_UNITS, LEVEL
 from neuroprior.behaviour.analysis.comparison import never_occur, never_taken, too_few, unit_name, units
-from neuroprior.behaviour.analysis.drift import action_drift, by_group, by_plan, by_position
+from neuroprior.behaviour.analysis.drift import by_group, by_plan, by_position
 from neuroprior.behaviour.analysis.lags import mutual_information
 from neuroprior.behaviour.analysis.motifs import motifs
+from neuroprior.behaviour.analysis.rate_drift import rate_drift
 from neuroprior.behaviour.recorded_plans import RecordedPlans, action_names, group_names
 from neuroprior.behaviour.reporting import figures
 from neuroprior.behaviour.reporting.conditions import condition_section
 from neuroprior.behaviour.reporting.document import Column, table
 from neuroprior.behaviour.reporting.durations import duration_section
+from neuroprior.behaviour.reporting.findings import Finding, p_words
 from neuroprior.behaviour.reporting.fits import ACTIONS
 from neuroprior.behaviour.reporting.individuals import individual_section
 from neuroprior.behaviour.reporting.modes import mode_section
-from neuroprior.behaviour.reporting.page import FigureBox, Section
+from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
 from neuroprior.behaviour.reporting.part import LISTED, Part, p_text, without_verdict
 from neuroprior.behaviour.reporting.recordings import recording_section
 from neuroprior.behaviour.reporting.scores import Evaluation
@@ -262,20 +265,12 @@ def drift_section(found: Evaluation) -> Part | None:
     tables = [table(tests_frame, _without_p(columns, found.too_few), caption)]
     caption = f"Bits per action of {model.label}. 95 % intervals over {found.unit}; of groups, over the plans of each."
     box = FigureBox(figures.drift_figure(drift, own), caption, "Bits per action by place, plan and group.", "drift")
-    actions = _action_drift(found.plans)
-    if len(actions):
-        most = actions.assign(size=-actions["change"].abs()).sort_values(["corrected", "size"], kind="stable")[:LISTED]
-        columns = {
-            "action": "action",
-            "first": lambda row: f"{100 * row.first_half:.2f}",
-            "second": lambda row: f"{100 * row.second_half:.2f}",
-            "change": lambda row: f"{100 * row.change:+.2f} ± {100 * (row.high - row.change):.2f}",
-            "p": lambda row: p_text(row.corrected),
-        }
-        caption = "Share of all actions, %, in the first and in the second half of the plans."
-        caption += "" if found.too_few else " p: corrected (Holm)."
-        tables.append(table(most, _without_p(columns, found.too_few), caption))
-    frames = {"drift": drift, "drift_tests": tests_frame, "action_drift": actions}
+    frames = {"drift": drift, "drift_tests": tests_frame, "rate_drift": pd.DataFrame()}
+    with suppress(ValueError):  # a single recording
+        rates = _rates(found)
+        frames["rate_drift"] = rates
+        tables.append(_rate_table(rates, found))
+        return Part(Section("Drift", text, tables, [box]), frames, findings=_rate_findings(rates))
     return Part(Section("Drift", text, tables, [box]), frames)
 
 
@@ -287,20 +282,53 @@ def _without_beginnings(found: Evaluation) -> Tensor:
     return late if enough and len(units(found.scored, late)[late].unique()) > 1 else found.mask
 
 
-def _action_drift(plans: Plans) -> pd.DataFrame:
-    """How the share of each action changes from the first to the second half of the plans."""
-    try:
-        found = action_drift(plans)
-    except ValueError:
-        return pd.DataFrame()  # too few plans with two halves
-    names = action_names(plans)
-    rows = [
-        {"action": names[one.action], "first_half": one.first, "second_half": one.second}
-        | one.change._asdict()
-        | {"corrected": one.corrected}
-        for one in found
-    ]
-    return pd.DataFrame(rows).rename(columns={"mean": "change"})
+def _rates(found: Evaluation) -> pd.DataFrame:
+    """How the rate of each behaviour changes, starred where it does; by watched time, too, where that is known."""
+    timed = found.recordings is not None and found.recordings.events["start"].notna().any()
+    source = found.recordings if timed and found.recordings is not None else found.plans
+    result = rate_drift(source)
+    frame = result.frame()
+    starred = (frame["corrected"] < LEVEL) & (result.num_units >= ENOUGH_UNITS) & (not too_few(found.plans))
+    if timed:
+        columns = {"times": "by_time", "low": "by_time_low", "high": "by_time_high"}
+        by_time = rate_drift(source, "time").frame().rename(columns=columns)
+        frame = frame.merge(by_time[["behaviour", *columns.values()]], on="behaviour", how="left")
+    return frame.assign(unit=result.unit, starred=starred)
+
+
+def _rate_table(rates: pd.DataFrame, found: Evaluation) -> Table:
+    columns: dict[str, Column] = {
+        "behaviour": "behaviour",
+        "bouts": "bouts:,",
+        "end / beginning": "times:.3g",
+        "95 % interval": lambda row: f"{row.low:.3g} to {row.high:.3g}",
+        "p": lambda row: p_text(row.corrected) + "*" * row.starred,
+    }
+    caption = (
+        f"Share of all bouts at the end of a recording, divided by that at its beginning; intervals over"
+        f" {rates['unit'].iloc[0]}."
+    )
+    caption += "" if found.too_few else " p: corrected (Holm). *: p < 0.05."
+    if "by_time" in rates:
+        caption += " By watched time: the same of the number of bouts by time."
+        columns["by watched time"] = lambda row: (
+            "" if pd.isna(row.by_time) else f"{row.by_time:.3g} ({row.by_time_low:.3g} to {row.by_time_high:.3g})"
+        )
+    return table(rates[:LISTED], _without_p(columns, found.too_few), caption, "Change of each behaviour")
+
+
+def _rate_findings(rates: pd.DataFrame) -> list[Finding]:
+    found = []
+    for row in rates.to_dict("records"):
+        name, times, low, high, corrected = (row[what] for what in ("behaviour", "times", "low", "high", "corrected"))
+        sentence = (
+            f"From the beginning to the end of a recording the share of {name} {'falls' if times < 1 else 'rises'} to"
+            f" {times:.3g} times, 95 % interval {low:.3g} to {high:.3g}; {p_words(corrected)}."
+        )
+        estimate = (times, low, high, float(row["p_value"]), float(corrected))
+        feature, starred = f"drift of {name}", bool(row["starred"])
+        found.append(Finding(f"drift: {name}", "drift", feature, *estimate, starred, sentence))
+    return found
 
 
 SECTIONS: dict[str, Callable[[Evaluation], Part | None]] = {

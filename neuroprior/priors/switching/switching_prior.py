@@ -44,11 +44,14 @@ class ModePosterior(NamedTuple):
         smoothed: `[N, L, K]`, float64: the modes given the whole plan.
         path: `[N, L]`, int64: the most probable modes of the whole plan together (Viterbi). Beyond a plan's end these
             have no meaning.
+        moves: `[N, K, K]`, float64: how often each mode (row) is expected to be followed by each (column), one action
+            later, given the whole plan.
     """
 
     filtered: Tensor
     smoothed: Tensor
     path: Tensor
+    moves: Tensor
 
 
 class Modes(NamedTuple):
@@ -325,12 +328,14 @@ class SwitchingPrior(HistoryPrior):
         self.check_plans(plans)
         if plans.actions.numel() == 0:
             none = self.first.new_zeros(*plans.actions.shape, self.num_modes)
-            return ModePosterior(none, none, none[..., 0].long())
+            return ModePosterior(none, none, none[..., 0].long(), none.new_zeros(len(plans), *[self.num_modes] * 2))
         found = []
-        for _, steps, likelihood in self._in_parts(plans):
+        for indices, steps, likelihood in self._in_parts(plans):
             path = most_probable_path(self.first, steps, likelihood).div(self.phases, rounding_mode="floor")
             modes = smooth(self.first, steps, likelihood)
-            found.append(ModePosterior(self._summed(modes.filtered), self._summed(modes.smoothed), path))
+            within = plans[indices].mask()[:, 1:, None, None]
+            moves = self._summed(self._summed((modes.moved * within).sum(1)).mT).mT
+            found.append(ModePosterior(self._summed(modes.filtered), self._summed(modes.smoothed), path, moves))
         return ModePosterior(*(torch.cat(some) for some in zip(*found, strict=True)))
 
     def beginning_in(self, mode: int, keep: bool = False) -> "SwitchingPrior":

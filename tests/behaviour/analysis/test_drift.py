@@ -9,8 +9,8 @@ import torch
 from scipy import stats
 
 from neuroprior import Plans
-from neuroprior._statistics import holm, mean_interval, paired_difference, ratio_difference
-from neuroprior.behaviour.analysis.drift import action_drift, by_group, by_plan, by_position
+from neuroprior._statistics import mean_interval, ratio_difference
+from neuroprior.behaviour.analysis.drift import by_group, by_plan, by_position
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.plans.folds import BLOCKS
 from tests.support.sources import FALSE_ALARM, refuses, seeded
@@ -205,49 +205,6 @@ def test_groups_that_do_not_differ():
     assert by_group(plans, noise(60, 3, 0) + 2 * plans.group[:, None], plans.mask()).p_value < 1e-6
 
 
-def test_actions_by_hand():
-    """Halves of plans of 4, 5 (without the central one), 2 and 1 (none) actions."""
-    actions = torch.tensor([[0, 1, 2, 2, 0], [0, 0, 1, 2, 0], [1, 0, 0, 0, 0], [2, 0, 0, 0, 0]])
-    found = action_drift(Plans(actions, 4, torch.tensor([4, 5, 2, 1])))
-    assert [one.action for one in found] == [0, 1, 2, 3]
-    assert [one.first for one in found] == pytest.approx([3 / 5, 2 / 5, 0, 0])
-    assert [one.second for one in found] == pytest.approx([2 / 5, 0, 3 / 5, 0])
-    for one, change in zip(found, ([-1, -1, 1], [-1, 0, -1], [2, 1, 0], [0, 0, 0]), strict=True):
-        assert one.change == pytest.approx(ratio_difference(change, [2, 2, 1]))
-    assert [one.corrected for one in found] == pytest.approx(holm([one.change.p_value for one in found]).tolist())
-
-
-def test_actions_of_groups_and_of_a_single_plan():
-    actions = torch.randint(3, (12, 6), generator=seeded(0))
-    grouped = action_drift(Plans(actions, 3, group=torch.arange(12) % 4))
-    single = action_drift(Plans(torch.randint(3, (1, 401), generator=seeded(1)), 3))
-    row = torch.randint(3, (1, 401), generator=seeded(1))[0]
-    for k in range(3):
-        first, second = ((part == k).double().mean(1) for part in (actions[:, :3], actions[:, 3:]))
-        want = paired_difference(*(part.view(3, 4).mean(0) for part in (second, first)))
-        assert grouped[k].change == pytest.approx(tuple(want))
-        halves = [(half == k).double().view(20, 10).mean(1) for half in (row[201:], row[:200])]
-        assert single[k].change == pytest.approx(tuple(paired_difference(*halves)))
-
-
-def test_actions_that_drift_and_that_do_not():
-    """A share of 0.5 that falls to 0.3 in the second halves; 200 sets where nothing changes, and 100 single plans."""
-    late = torch.arange(40) >= 20
-    actions = (torch.rand(200, 40, generator=seeded(0)) >= torch.where(late, 0.3, 0.5)).long()
-    found = action_drift(Plans(actions, 3))
-    assert found[0].change.low <= -0.2 <= found[0].change.high
-    assert found[0].corrected < 1e-6
-    assert found[2].change == (0, 0, 0, 1)
-    wrong = np.zeros(2)
-    for seed in range(200):
-        generator = seeded(seed)
-        several = Plans(torch.randint(4, (30, 10), generator=generator), 4)
-        single = Plans(torch.randint(4, (1, 600), generator=generator), 4)
-        wrong += [min(one.corrected for one in action_drift(p)) <= 0.05 for p in (several, single)]
-    assert few(wrong[0], 200, 0.05)
-    assert few(wrong[1], 200, 0.05)
-
-
 BITS, MASK = torch.ones(3, 4), torch.arange(4) < torch.tensor([4, 2, 3])[:, None]
 
 
@@ -273,9 +230,6 @@ def test_too_few_actions():
         by_position(plans_of(3, 4), BITS, MASK & (torch.arange(4) == 0))
     with refuses("parts"):
         by_position(plans_of(3, 4), BITS, MASK, 0)
-    for plans in (plans_of(3, 1), plans_of(1, 3), plans_of(0, 3)):
-        with refuses("`plans` must be two"):
-            action_drift(plans)
 
 
 def test_plans_that_are_equal_but_for_rounding_do_not_differ():
@@ -324,7 +278,6 @@ def test_fragments_of_a_recording_drift_as_one():
     assert positions[0].actions.tolist() == positions[1].actions.tolist()
     assert by_plan(*same[0]).bits.tolist() == pytest.approx(by_plan(*same[1]).bits.tolist())
     assert by_group(*same[0]).p_value == pytest.approx(by_group(*same[1]).p_value)
-    assert action_drift(whole)[0].change == pytest.approx(action_drift(cut)[0].change)
 
 
 def seeded_plans(num, length, began=False):

@@ -214,21 +214,3 @@ def test_the_beginnings_of_plans_are_no_drift(length, words):
     change = part.frames["drift_tests"].set_index("test").loc["change over a plan, bits"]
     assert (change["low"] < 0 < change["high"]) == (length == 20)
     assert any(words in line for line in part.section.text)
-
-
-def test_the_action_that_changes_most_clearly_comes_first():
-    """By the corrected p-value: a small change of a rare action may be clearer than a large one of a common action."""
-    rng = np.random.default_rng(0)
-    rows = []
-    for _ in range(30):
-        first = [*rng.choice(3, 10, p=[0.5, 0.5, 0])]
-        often = rng.choice([0.2, 0.8]) if rng.random() < 0.9 else 0.5
-        second = [*rng.choice(3, 9, p=[often, 1 - often, 0]), 2]
-        rows.append(first + second)
-    actions = torch.tensor(np.array(rows))
-    actions[:12, 15:19] = 0
-    plans = RecordedPlans(actions, 3, action_names=NAMES)
-    part = drift_section(evaluate_saved({"uniform": UniformPrior(3)}, plans, 0))
-    frame = part.frames["action_drift"].set_index("action")
-    assert cells(part, len(part.section.tables) - 1)[0][0] == "dig"
-    assert frame["change"].abs().idxmax() != "dig"

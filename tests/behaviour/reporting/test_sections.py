@@ -4,12 +4,13 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 import torch
 from matplotlib.figure import Figure
 
-from neuroprior.behaviour import RecordedPlans
+from neuroprior.behaviour import RecordedPlans, rate_drift, read
 from neuroprior.behaviour.reporting.document import Document
 from neuroprior.behaviour.reporting.options import FitOptions, ReadOptions
 from neuroprior.behaviour.reporting.page import FigureBox
@@ -45,28 +46,31 @@ def test_gains_are_starred_where_their_interval_is_above_0():
     assert {lag: cell.strip() for lag, cell in shown.items()} == want
 
 
-def test_actions_whose_share_changes_most_come_first():
-    """Of equally significant ones, whether they become more or less frequent."""
-    plans = Plans(torch.randint(6, (40, 12), generator=seeded(0)), 6, action_names=list("abcdef"))
-    part = drift_section(found_in(plans))
-    frame = part.frames["action_drift"]
-    assert (frame["corrected"] == 1).sum() > 3
-    order = sorted(frame.itertuples(), key=lambda row: (row.corrected, -abs(row.change)))
-    table = part.section.tables[-1]
-    assert [row[:4] for row in table.rows] == [
-        [
-            row.action,
-            f"{100 * row.first_half:.2f}",
-            f"{100 * row.second_half:.2f}",
-            f"{100 * row.change:+.2f} ± {100 * (row.high - row.change):.2f}",
-        ]
-        for row in order
-    ]
-    halves = [plans.actions[:, :6], plans.actions[:, 6:]]
-    for row in order:
-        own = [float((half == "abcdef".index(row.action)).double().mean()) for half in halves]
-        assert (row.first_half, row.second_half) == pytest.approx(own)
-        assert row.change == pytest.approx(own[1] - own[0])
+@pytest.mark.parametrize(("animals", "starred"), [(6, ["run", "dig", "eat"]), (4, [])])
+def test_drifts_are_starred_as_findings_where_there_are_enough_subjects(animals, starred):
+    """Running fades in all animals, so that the shares of the others rise."""
+    generator, rows = np.random.default_rng(0), []
+    for animal in range(animals):
+        start = np.sort(generator.random(200))
+        run = generator.random(200) < 0.9 * np.exp(-3 * start)
+        names = np.where(run, "run", generator.choice(["dig", "eat"], 200))
+        times = {"start": start, "stop": np.append(start[1:], 1)}
+        rows.append(pd.DataFrame({"animal": f"m{animal}", "behaviour": names} | times))
+    recordings = read(pd.concat(rows))
+    found = replace(found_in(recordings.plans()), recordings=recordings)
+    part = drift_section(found)
+    assert [one.feature for one in part.findings if one.starred] == [f"drift of {name}" for name in starred]
+    assert [row[0] for row in part.section.tables[-1].rows if "*" in row[-2]] == starred
+    frame = rate_drift(recordings).frame()
+    assert [one.p_corrected for one in part.findings] == frame["corrected"].tolist()
+    by_time = rate_drift(recordings, "time").frame().set_index("behaviour")["times"]
+    assert part.frames["rate_drift"].set_index("behaviour")["by_time"].to_dict() == pytest.approx(by_time.to_dict())
+    if starred:
+        row = frame.iloc[0]
+        assert part.findings[0].sentence == (
+            f"From the beginning to the end of a recording the share of run falls to {row.times:.3g} times, 95 %"
+            f" interval {row.low:.3g} to {row.high:.3g}; p < .0001."
+        )
 
 
 ASKED: dict[str, Any] = {"skip": 1, "fits": replace(QUICK_IN_TWO, seed=5)}
@@ -81,7 +85,7 @@ def made() -> Document:
 def test_a_report_has_its_tables_and_figures(made):
     assert {*made.tables, "motifs"} == {
         *("plans", "actions", "lags", "transitions", "transition_test"),
-        *("motifs", "drift", "drift_tests", "action_drift"),
+        *("motifs", "drift", "drift_tests", "rate_drift"),
         *("individuals", "individual_budget", "individual_types"),
     }
     assert all(isinstance(frame, pd.DataFrame) for frame in made.tables.values())
@@ -99,7 +103,7 @@ def test_what_is_asked_for_is_done(made):
 
 def test_the_lead_names_the_best_model(made):
     best = made.tables["plans"].sort_values("bits_per_action").iloc[0]
-    assert " ".join(made.said) == (
+    assert made.said[0] == (
         f"The best model, {best.model}, takes {best.bits_per_action:.3f} bits per action"
         f" (95 % interval {best.low:.3f} to {best.high:.3f} over groups)."
     )

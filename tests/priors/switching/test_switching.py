@@ -50,7 +50,9 @@ def enumerated(prior, plans):
         log_probs = prior.log_probs[rows[:, t]][each, mode, plans.actions[:, t].long()[:, None]]
         joint *= before * log_probs.double().exp()
     smoothed = torch.stack([(joint[:, :, None] * (where == k)).sum(1) for k in range(prior.num_modes)], -1)
-    return joint.sum(1), smoothed / joint.sum(1)[:, None, None], where[joint.argmax(1)]
+    pairs = torch.nn.functional.one_hot(where[:, :-1] * prior.num_modes + where[:, 1:], prior.num_modes**2).sum(1)
+    moves = (joint @ pairs.double() / joint.sum(1)[:, None]).view(num, prior.num_modes, prior.num_modes)
+    return joint.sum(1), smoothed / joint.sum(1)[:, None, None], where[joint.argmax(1)], moves
 
 
 @pytest.mark.parametrize(("contexts", "order"), [(None, 0), (None, 1), (4, 0), (4, 2)])
@@ -58,11 +60,18 @@ def test_inference_equals_enumeration(contexts, order):
     plans = some_plans(contexts=contexts)
     prior = SwitchingPrior(3, 3, order, contexts, smoothing=0.5, **SHORT).fit(plans, generator=seeded(0))
     some = plans[:8]
-    likelihood, smoothed, path = enumerated(prior, some)
+    likelihood, smoothed, path, moves = enumerated(prior, some)
     torch.testing.assert_close(prior.log_prob(some).double(), likelihood.log(), atol=2e-6, rtol=0)
     found = prior.posterior(some)
     torch.testing.assert_close(found.smoothed, smoothed, atol=1e-6, rtol=0)
     assert found.path.equal(path)
+    torch.testing.assert_close(found.moves, moves, atol=1e-6, rtol=0)
+    cut = replace(some, lengths=torch.tensor([6, 1, 6, 3, 2, 5, 0, 4]))
+    short = replace(
+        cut, lengths=None, actions=some.actions[:, :3], context=None if contexts is None else some.context[:, :3]
+    )
+    torch.testing.assert_close(prior.posterior(cut).moves[3], enumerated(prior, short)[3][3], atol=1e-6, rtol=0)
+    assert prior.posterior(cut).moves.sum((1, 2)).round().tolist() == [5, 0, 5, 2, 1, 4, 0, 3]
     for t in range(1, 7):  # what is known after t actions is what whole plans of t actions say
         short = replace(some, actions=some.actions[:, :t], context=None if contexts is None else some.context[:, :t])
         torch.testing.assert_close(found.filtered[:, t - 1], enumerated(prior, short)[1][:, -1], atol=1e-6, rtol=0)
@@ -114,7 +123,7 @@ def test_first_modes_and_transitions_are_smoothed():
     plans, smoothing, stay = some_plans(num=12, length=4, contexts=2), 3.0, 2.0
     how = {"order": 0, "num_contexts": 2, "smoothing": smoothing, "stay": stay, "restarts": 1}
     prior = SwitchingPrior(3, 3, **how, max_iterations=1).fit(plans, generator=seeded(0))
-    likelihood, smoothed, _ = enumerated(prior, plans)
+    likelihood, smoothed, *_ = enumerated(prior, plans)
     rows, cells = prior.cells(plans.actions, plans.context)
     moved = torch.zeros(2, 3, 3, dtype=torch.double)
     for path in itertools.product(range(3), repeat=4):
@@ -328,7 +337,12 @@ def test_going_on_from_nothing_begins():
 def test_plans_without_actions(shape):
     none = Plans(torch.zeros(shape, dtype=torch.long), 3)
     prior = SwitchingPrior(3, 2).fit(none, generator=seeded(0))
-    assert [tuple(values.shape) for values in prior.posterior(none)] == [(*shape, 2), (*shape, 2), shape]
+    assert [tuple(values.shape) for values in prior.posterior(none)] == [
+        (*shape, 2),
+        (*shape, 2),
+        shape,
+        (shape[0], 2, 2),
+    ]
     torch.testing.assert_close(prior.log_prob([[0, 1]]).exp(), torch.tensor([1 / 9]))
 
 

@@ -7,7 +7,6 @@ import torch
 
 from neuroprior.behaviour import (
     action_bits,
-    action_drift,
     baselines,
     by_group,
     by_plan,
@@ -16,6 +15,7 @@ from neuroprior.behaviour import (
     mode_frame,
     mode_plans,
     mode_table,
+    rate_drift,
     score,
     score_bits,
 )
@@ -45,7 +45,7 @@ def comparisons():
         "drift by group": by_group(held_out, bits, mask),
         "drift by plan": by_plan(held_out, bits, mask),
         "drift by position": by_position(held_out, bits, mask, 4),
-        "drift of actions": action_drift(held_out),
+        "drift of rates": rate_drift(held_out).frame(),
     }
     many = replace(behaviour(40, 8, seed=3), group=torch.arange(40) % 3)
     rising = torch.arange(40.0)[:, None].double() + torch.rand(40, 8, generator=seeded(0))
