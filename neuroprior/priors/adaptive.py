@@ -171,10 +171,10 @@ class AdaptivePrior(Prior):
         code, found = torch.zeros(len(actions), steps, dtype=torch.long, device=actions.device), []
         for level, name in enumerate(self.tables):
             if level > 0:
-                # The action so many steps before each: none stands before the first.
+                # The action so many steps before each; before the first stands -1, which is no action.
                 padded = functional.pad(actions, (level, 0), value=-1)
                 then, last = padded[:, : len(past)], padded[:, now]
-                alike = alike & (last[..., None] == then[:, None]) & (last[..., None] >= 0)
+                alike = alike & (last[..., None] == then[:, None])
                 code = code + last.clamp(min=0) * self.num_actions ** (level - 1)
             weights = alike.float()
             if self.decay < 1:
@@ -305,7 +305,7 @@ def likeliest_concentrations(probs: Tensor, counts: Tensor, totals: Tensor) -> t
                     now = (counts[level] + c * now) / (totals[level] + c)
                 total = -now.clamp(min=1e-300).log().sum()
                 slope = torch.autograd.grad(total, free)[0] if levels else free
-            return float(total), slope.numpy()
+            return float(total.detach()), slope.detach().numpy()
 
         if not levels:
             return loss(np.empty(0))[0], {}

@@ -1,7 +1,7 @@
 """`python -m eval plans FILE`: known values, test files, and runs that were interrupted."""
 
-import math
 import json
+import math
 import os
 import signal
 import subprocess
