@@ -1,5 +1,6 @@
 """Priors: distributions over action sequences, learned from plans, that samplers step through."""
 
+from neuroprior.priors.adaptive import AdaptivePrior
 from neuroprior.priors.counts import ContextTreePrior, Leaf, MarkovPrior
 from neuroprior.priors.ensembles import CombinedPrior, MixturePrior, StackedPrior
 from neuroprior.priors.fitting import fit
@@ -14,6 +15,7 @@ from neuroprior.priors.uniform import UniformPrior
 __all__ = [
     "Posterior",
     "infer",
+    "AdaptivePrior",
     "CombinedPrior",
     "ContextTreePrior",
     "GRUPrior",

@@ -10,6 +10,7 @@ from torch import Tensor
 from neuroprior._registry import Registry
 from neuroprior.plans import Plans
 from neuroprior.plans.sequences import Sequences
+from neuroprior.priors.adaptive import AdaptivePrior
 from neuroprior.priors.construction import construct, context_arguments
 from neuroprior.priors.counts import ContextTreePrior, MarkovPrior
 from neuroprior.priors.ensembles import CombinedPrior, MixturePrior, StackedPrior
@@ -104,6 +105,11 @@ def _mixture(num_actions: int, num_contexts: int | None = None) -> MixturePrior:
     return MixturePrior(num_actions, [kind(num_actions, num_contexts=num_contexts) for kind in kinds])
 
 
+def _adaptive(num_actions: int, num_contexts: int | None = None) -> AdaptivePrior:
+    """A context tree, drawn towards what the individual did."""
+    return AdaptivePrior(ContextTreePrior(num_actions, num_contexts=num_contexts), [10.0, 10.0, 10.0])
+
+
 _CORE: dict[str, MakePrior] = {
     "combined": CombinedPrior,
     "uniform": UniformPrior,
@@ -112,6 +118,7 @@ _CORE: dict[str, MakePrior] = {
     "gru": GRUPrior,
     "transformer": TransformerPrior,
     "stacked": StackedPrior,
+    "adaptive": _adaptive,
     "mixture": _mixture,
     "switching": SwitchingPrior,
 }

