@@ -25,8 +25,8 @@ from neuroprior.agents import Replay
 from neuroprior.behaviour import (
     SemiMarkovPrior,
     choose_modes,
+    how_far_back,
     motifs,
-    mutual_information,
 )
 from neuroprior.behaviour.reporting import FitOptions, report
 from neuroprior.control import ICEMPlanner, MPPIPlanner, NoisePrior, ShootingPlanner, VectorGRU, VectorPlans
@@ -91,7 +91,7 @@ SHARES = {
 ORDERS = {
     "order": [partial(MarkovPrior, 3), partial(SwitchingPrior, 3, 2)],
     "depth": [partial(ContextTreePrior, 3)],
-    "skip": [partial(mutual_information, PLANS, 2)],
+    "skip": [partial(how_far_back, PLANS, 2)],
     "first": [PLANS.steps, VECTORS.steps],
     "stop": [partial(VECTORS.steps, 1)],
     "length": [partial(all_plans, 2)],

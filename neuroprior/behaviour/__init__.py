@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     )
     from neuroprior.behaviour.analysis.individuals import Individuals, Types, individual_types, individuals
     from neuroprior.behaviour.analysis.interaction import ConditionInteraction, InteractionFamily
-    from neuroprior.behaviour.analysis.lags import LagInformation, mutual_information
+    from neuroprior.behaviour.analysis.lags import HowFarBack, how_far_back
     from neuroprior.behaviour.analysis.modes import ModeChoice, choose_modes, mode_frame, mode_plans, mode_table
     from neuroprior.behaviour.analysis.motifs import Motif, motifs
     from neuroprior.behaviour.analysis.permutation_design import PermutationDesign
@@ -71,11 +71,11 @@ __all__ = [
     "DurationModel",
     "FitOptions",
     "GroupDrift",
+    "HowFarBack",
     "Individuals",
     "InteractionFamily",
     "Interval",
     "LAW_NAMES",
-    "LagInformation",
     "LawName",
     "ModeChoice",
     "Motif",
@@ -101,6 +101,7 @@ __all__ = [
     "choose_modes",
     "compare_conditions",
     "holm",
+    "how_far_back",
     "individual_types",
     "individuals",
     "large_study",
@@ -109,7 +110,6 @@ __all__ = [
     "mode_plans",
     "mode_table",
     "motifs",
-    "mutual_information",
     "paired_difference",
     "rate_drift",
     "ratio_difference",

@@ -99,8 +99,7 @@ def test_two_actions_back_and_no_further(second_order):
             assert row["low"] > 0.01
         else:  # nothing, but for what is lost to thinner counts
             assert -0.1 < row["bits"] < 0.01
-    informed = {row["lag"]: row for row in results["lags"] if row["what"] == "mutual information"}
-    assert all(informed[lag]["low"] > informed[lag]["critical_value"] for lag in (1, 2))
+    assert [row["adds"] for row in results["how_far_back"]] == [True, True, False, False]
 
 
 def test_a_planted_difference_of_groups_is_found(tmp_path):

@@ -1,172 +1,182 @@
-"""How far back dependence reaches: the information of an action about later ones, by counts and by a prior."""
+"""How far back dependence reaches: what each earlier action adds to the prediction from all later ones."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from math import log
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy import special
-from torch import Tensor
 
 from neuroprior._checks import check_count, check_sizes
 from neuroprior._random import generator_on
-from neuroprior.behaviour.analysis.comparison import unit_name, units
+from neuroprior._statistics import LEVEL, Difference, ratio_difference
+from neuroprior.behaviour.analysis.comparison import too_few, unit_name, units
 from neuroprior.plans import Plans
-from neuroprior.plans.folds import BLOCKS
 from neuroprior.plans.plans import check_are_plans
 
-MOST_BLOCKS = 200
-"""Blocks of the jackknife; more units are joined to so many."""
+MAX_FOLDS = 20
+"""Parts of the units, of which each is held out once; fewer where there are fewer units."""
 
-ENOUGH_PAIRS = 20
-"""Pairs per degree of freedom, (A - 1)**2, below which the jackknife leaves a bias, which shuffled pairs estimate."""
+PSEUDO_COUNTS = 4.0 ** np.arange(-6, 9)
+"""Weights of a history without its oldest action; the likeliest is taken."""
 
-SHUFFLES = 20
-"""Shuffles that estimate it."""
+MIN_GAIN = 5e-4
+"""Bits of a gain that count as none: a longer history that says nothing still smooths a little better."""
 
-MOST_CELLS = 2**24
-"""Cells of a table of counts up to which it is made in full."""
+WORDS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight")
+ORDINALS = ("the last", "a second", "a third", "a fourth", "a fifth", "a sixth", "a seventh", "an eighth")
+
+Array = NDArray[Any]
 
 
-@dataclass(frozen=True)
-class LagInformation:
-    """The mutual information of an action and the one `lag` steps later.
+@dataclass(frozen=True, eq=False, repr=False)
+class HowFarBack:
+    """What the action k = 1 to K steps back adds to the prediction from the k - 1 later ones.
 
     Attributes:
-        lag: k.
-        bits: the mutual information, corrected for bias; where it is 0, the estimate is as often slightly negative as
-            positive.
-        low, high: its 95 % interval over units.
-        critical_value: bits that the estimate stays below with a probability of 95 % if the two are independent.
-        pairs: how many pairs of actions were counted.
+        gains: K: bits per held-out action, with the 95 % interval over units and the p-value of 0.
+        corrected: float64 `[K]`: the p-value of a gain above `MIN_GAIN` at this lag and all before it. Lags are tested
+            in their order, up to the first without a gain, so that no further correction is needed.
+        reach: the last lag before the first whose corrected p-value is not below `LEVEL`.
+        unit: what intervals are over, such as "groups".
+        num_units: how many there are.
+        few: why no verdict is drawn; "" where one is.
     """
 
-    lag: int
-    bits: float
-    low: float
-    high: float
-    critical_value: float
-    pairs: int
+    gains: Sequence[Difference]
+    corrected: Array
+    reach: int
+    unit: str
+    num_units: int
+    few: str
+
+    def __repr__(self) -> str:
+        """Return the verdict."""
+        return f"HowFarBack({self.num_units} {self.unit}: {self.verdict})"
+
+    @property
+    def verdict(self) -> str:
+        """Return how far back actions matter, in a sentence."""
+        if self.few:
+            return f"How far back behaviour reaches is not said: {self.few}."
+        reached = f"How far back: {_word(self.reach)} behaviour{'s' * (self.reach > 1)}"
+        if self.reach == len(self.gains):
+            return f"{reached} at least."
+        gain, low, high, _ = self.gains[self.reach]
+        bounds = f"{_digits(gain)} bits, {_digits(low)} to {_digits(high)}"
+        next_one = ORDINALS[self.reach] if self.reach < len(ORDINALS) else f"lag {self.reach + 1}"
+        return f"{reached}; {next_one} adds nothing ({bounds})."
+
+    def frame(self) -> Any:
+        """Return a row a lag, as a pandas frame: `lag, bits, low, high, p_value, corrected, units`, `adds` or not."""
+        import pandas as pd
+
+        frame = pd.DataFrame(self.gains).rename(columns={"mean": "bits"})
+        frame.insert(0, "lag", np.arange(len(frame)) + 1)
+        adds = (frame["lag"] <= self.reach) & (self.few == "")
+        return frame.assign(corrected=self.corrected, units=self.num_units, adds=adds)
 
 
-def mutual_information(
-    plans: Plans, max_lag: int = 20, skip: int = 0, generator: torch.Generator | None = None
-) -> list[LagInformation]:
-    """The mutual information I(a_t; a_{t-k}) of actions k = 1 to `max_lag` steps apart in the same plan, in bits.
+def _digits(value: float) -> str:
+    text = f"{round(value, 4) + 0:.2g}"
+    return text.replace("0.", ".", 1) if abs(value) < 1 else text
 
-    Counts are pooled over plans: if plans (or groups) differ in how often they take each action, there is information
-    at every lag, namely about which plan it is.
 
-    Bias is corrected, and the interval made, by a jackknife (for units of unequal size: Busing, Meijer and van der
-    Leeden 1999, Delete-m jackknife for unequal m). That of the bias leaves out one plan at a time, or one of `BLOCKS`
-    consecutive parts if there are fewer plans; unlike the correction of Miller and Madow it holds for successive pairs
-    that depend on each other. That of the interval leaves out the units of `neuroprior.behaviour.units`,
-    joined to at most `MOST_BLOCKS`. If the actions are independent, twice the number of pairs times the information (in
-    nats) is chi-square distributed up to a factor, which the bias determines (Rao and Scott 1981): that gives
-    `critical_value`. With fewer than `ENOUGH_PAIRS` pairs per degree of freedom, (A - 1)**2, some bias is left:
-    `critical_value` is then at least what 95 % of shuffled pairs stay below. An interval extends at least by
-    `critical_value` to both sides, as the jackknife's error vanishes if there is no information.
+def _word(number: int) -> str:
+    return WORDS[number] if number < len(WORDS) else str(number)
+
+
+def how_far_back(plans: Plans, max_lag: int = 4, skip: int = 0) -> HowFarBack:
+    """Return how many past actions help to predict the next one, tested over units.
+
+    Chains of order 0 to K predict actions of units that they have not learned from. The probabilities after a history
+    are those after the same without its oldest action, with so many pseudo-counts as make the training actions most
+    probable (MacKay and Peto 1995): where the oldest action says nothing, nothing is lost. The gain of lag k is the
+    difference between the bits of the chains of order k - 1 and k, on the same actions.
 
     Args:
-        plans: the plans.
-        max_lag: the longest lag.
-        skip: number of first actions of each plan that only count as the earlier of a pair. With `max_lag` the later
-            actions are the same for all lags.
-        generator: draws the shuffles, if there are few pairs.
-
-    Returns:
-        One for each lag, up to the longest with two pairs. Intervals and critical values are not corrected for the
-        number of lags.
+        plans: at least two; for units see `neuroprior.behaviour.units`.
+        max_lag: K; less where plans are shorter.
+        skip: first actions of each plan that are not predicted.
 
     Raises:
-        ValueError: a lag below 1, a negative `skip`, or plans without two pairs of successive actions.
+        ValueError: a lag below 1, a negative `skip`, or fewer than two units with successive actions.
 
     Example:
-        >>> plans = Plans(torch.tensor([[0, 1] * 20]).repeat(4, 1), 2)
-        >>> [
-        ...     round(found.bits, 2)
-        ...     for found in mutual_information(plans, max_lag=2, generator=torch.Generator().manual_seed(0))
-        ... ]
-        [1.0, 1.0]
+        >>> plans = Plans(torch.tensor([[0, 1] * 20]).repeat(6, 1), 2)
+        >>> how_far_back(plans, max_lag=2).verdict
+        'How far back: one behaviour; a second adds nothing (0 bits, 0 to 0).'
     """
     check_are_plans(plans)
     check_sizes(max_lag=max_lag)
     check_count("skip", skip, 0)
-    found, generator = [], generator_on(generator, plans.actions.device)
-    for lag in range(1, min(max_lag, plans.max_length - 1) + 1):
-        later = plans.mask()
-        later[:, : max(lag, skip)] = False
-        if int(later.sum()) < 2:
+    mask = plans.mask().cpu()
+    later = mask.clone()
+    later[:, : max(1, skip)] = False
+    if len(units(plans, later)[later].unique()) < 2 or unit_name(plans, later) == "parts of the plan":
+        raise ValueError(f"`plans` must have two units with successive actions after the first {skip}, got fewer")
+    actions = plans.actions.cpu().long().numpy()[mask.numpy()]
+    step = mask.nonzero()[:, 1].numpy()
+    unit = np.unique(units(plans, mask)[mask].cpu().numpy(), return_inverse=True)[1]
+    fold = unit % MAX_FOLDS
+    history, bits = np.zeros(len(actions), np.int64), _bits_of_shares(actions, fold, plans.num_actions)
+    gains, above = list[Difference](), list[float]()
+    for lag in range(1, max_lag + 1):
+        known = step >= lag
+        inside = known & (step >= skip)
+        if len(np.unique(unit[inside])) < 2:
             break
-        found.append(_information(plans, lag, later, generator))
-    if not found:
-        raise ValueError(f"plans: two pairs of successive actions are needed after the first {skip}; there are fewer")
-    return found
+        past = np.where(known, np.roll(actions, lag) + 1, 0)
+        history = np.unique(history * (plans.num_actions + 1) + past, return_inverse=True)[1]
+        better = _bits_after(history, actions, fold, bits, known)
+        gain, size = np.zeros(unit.max() + 1), np.bincount(unit[inside], minlength=unit.max() + 1)
+        np.add.at(gain, unit[inside], (bits - better)[inside])
+        gain, size = np.round(gain, 9)[size > 0], size[size > 0]
+        gains.append(ratio_difference(gain, size))
+        more = ratio_difference(gain - MIN_GAIN * size, size)
+        above.append(more.p_value if more.mean > 0 else 1.0)
+        bits = better
+    corrected = np.maximum.accumulate(above)
+    reach, few = int((corrected < LEVEL).sum()), too_few(plans, later)
+    return HowFarBack(gains, corrected, reach, unit_name(plans, later), int(unit.max()) + 1, few)
 
 
-def _information(plans: Plans, lag: int, later: Tensor, generator: torch.Generator) -> LagInformation:
-    """One lag; `later [N, L]` marks the later actions of the pairs."""
-    then, past = plans.actions[later].long(), plans.actions[:, :-lag][later[:, lag:]].long()
-    actions, pairs = plans.num_actions, len(then)
-    plan = (later.any(1).cumsum(0) - 1)[:, None].expand(later.shape)[later]
-    enough = int(plan[-1]) + 1 >= BLOCKS
-    fine = plan % MOST_BLOCKS if enough else torch.arange(pairs, device=plan.device) * min(BLOCKS, pairs) // pairs
-    nats, bias, _, _ = _jackknife(past, then, actions, fine)
-    unit = units(plans, later)[later]
-    unit = ((unit.bincount() > 0).cumsum(0) - 1)[unit]  # a group without pairs must not leave a block empty
-    _, _, error, blocks = _jackknife(past, then, actions, unit % MOST_BLOCKS)
-    freedom = (len(past.unique()) - 1) * (len(then.unique()) - 1)
-    critical = max(bias, 0) * (float(special.chdtri(freedom, 0.05)) / freedom - 1) if freedom else 0.0
-    if pairs < ENOUGH_PAIRS * freedom:
-        order = [torch.randperm(pairs, generator=generator, device=past.device) for _ in range(SHUFFLES)]
-        shuffled = [_jackknife(past, then[index], actions, fine)[:2] for index in order]
-        left = torch.tensor([whole - part for whole, part in shuffled], dtype=torch.double)
-        critical = max(critical, float(left.mean() + special.ndtri(0.95) * left.std()))
-    half = max(float(special.stdtrit(blocks - 1, 0.975)) * error, critical)
-    bits, half, critical = (nats - bias) / log(2), half / log(2), critical / log(2)
-    return LagInformation(lag, bits, bits - half, bits + half, critical, pairs)
+def _bits_of_shares(actions: Array, fold: Array, size: int) -> Array:
+    """Return the bits of each action `[M]` by the shares of all in the other folds, with one pseudo-count each."""
+    counts = np.zeros((fold.max() + 1, size))
+    np.add.at(counts, (fold, actions), 1)
+    others = counts.sum(0) - counts + 1
+    return np.asarray(-np.log2(others[fold, actions] / others.sum(1)[fold]))
 
 
-def _jackknife(past: Tensor, then: Tensor, num_actions: int, block: Tensor) -> tuple[float, float, float, int]:
-    """The plug-in information (nats) of pairs `[M]` in blocks `[M]`, its bias, its error, and the number of blocks."""
-    whole, without, size = _leave_one_out(past, then, num_actions, block)
-    share = size / size.sum()
-    bias = ((1 - share) * (without - whole)).sum()
-    pseudo = (whole - (1 - share) * without) / share
-    variance = (share / (1 - share) * (pseudo - (whole - bias)) ** 2).mean()
-    return float(whole), float(bias), float(variance.sqrt()), len(size)
+def _bits_after(history: Array, actions: Array, fold: Array, lower: Array, known: Array) -> Array:
+    """Return the bits of each action `[M]` after its history, learned in the other folds.
+
+    Args:
+        history: `[M]`: its number.
+        actions, fold: `[M]`.
+        lower: `[M]`: the bits after the history without its oldest action; those of unknown histories remain.
+        known: bool `[M]`: whether the history is there.
+    """
+    bits, prob = lower.copy(), np.exp2(-lower)
+    pair = np.unique(history * (actions.max() + 1) + actions, return_inverse=True)[1]
+    for number in np.unique(fold):
+        training, held_out = known & (fold != number), known & (fold == number)
+        of_pair, of_history = (np.bincount(code[training], minlength=code.max() + 1) for code in (pair, history))
+        pairs, first = np.unique(pair[training], return_index=True)
+        # The probability of each pair is that without its own fold for all of them: nearly the same in each.
+        weight = max(PSEUDO_COUNTS, key=lambda one: _evidence(of_pair[pairs], prob[training][first], of_history, one))
+        likely = (of_pair[pair] + weight * prob) / (of_history[history] + weight)
+        bits[held_out] = -np.log2(likely[held_out])
+    return bits
 
 
-def _leave_one_out(past: Tensor, then: Tensor, num_actions: int, block: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The plug-in information of all pairs, that of all but each block's `[B]` (nats), and the blocks' sizes `[B]`."""
-    cells, num = num_actions * num_actions, int(block.max()) + 1
-    codes = block * cells + past * num_actions + then
-    if num * cells <= MOST_CELLS:  # far faster than sorting
-        counts = codes.bincount()
-        codes = counts.nonzero()[:, 0]
-        counts = counts[codes].double()
-    else:
-        codes, counts = codes.unique(return_counts=True)
-        counts = counts.double()
-    of = codes // cells
-
-    def per(index: Tensor, length: int, values: Tensor) -> Tensor:
-        return values.new_zeros(length).index_add_(0, index, values)
-
-    kinds, kind = (codes % cells).unique(return_inverse=True)
-    total = per(kind, len(kinds), counts)
-    # Only the cells that a block has change when it is left out: the tables of the others are never made.
-    change = torch.special.xlogy(total[kind] - counts, total[kind] - counts) - torch.special.xlogy(total, total)[kind]
-    whole = torch.special.xlogy(total, total).sum()
-    without = whole + per(of, num, change)
-    for action in (codes % cells // num_actions, codes % num_actions):
-        table = per(of * num_actions + action, num * num_actions, counts).view(num, num_actions)
-        rest = table.sum(0) - table
-        whole = whole - torch.special.xlogy(table.sum(0), table.sum(0)).sum()
-        without = without - torch.special.xlogy(rest, rest).sum(1)
-    size = per(of, num, counts)
-    filled, pairs = size > 0, size.sum()
-    left = (pairs - size)[filled]
-    return whole / pairs + pairs.log(), without[filled] / left + left.log(), size[filled]
+def _evidence(counts: Array, lower: Array, totals: Array, weight: float) -> float:
+    """Return the log-probability of counts under a Dirichlet prior of `weight` pseudo-counts, spread as `lower`."""
+    of_pairs = special.gammaln(counts + weight * lower) - special.gammaln(weight * lower)
+    return float(of_pairs.sum() + (special.gammaln(weight) - special.gammaln(totals + weight)).sum())
 
 
 def pieces(plans: Plans, length: int, most: int, generator: torch.Generator | None = None) -> Plans:

@@ -78,7 +78,7 @@ def model_names(frame: pd.DataFrame) -> pd.Series:
 
 def lag_names(lags: pd.DataFrame) -> pd.Series:
     """The name of the curve of each row of the table `lags`."""
-    return ("gain, " + model_names(lags)).where(lags["what"] == "gain", lags["what"])
+    return "gain, " + model_names(lags)
 
 
 @drawn
@@ -127,32 +127,25 @@ def _edge(bits: Array) -> float:
 
 @drawn
 def lag_figure(lags: pd.DataFrame) -> Figure:
-    """Bits that the action k steps back gives, a line with its band for each model and for mutual information.
+    """Bits that the action k steps back adds, a line with its band for each model.
 
     Where the values span decades the axis is logarithmic above, and linear around 0, where estimates are negative too.
 
     Args:
-        lags: the table `lags` of a report: `what` ("mutual information" or "gain"), `model`, `context`, `lag`, `bits`,
-            `low`, `high`, and `critical_value`, the 95 % quantile of what independent actions would give, or missing.
+        lags: the table `lags` of a report: `model`, `context`, `lag`, `bits`, `low`, `high`.
     """
     expect_some("lags", lags)
     figure, (axes,) = panels(1, 1, (WIDTH, 3.7))
     sizes = np.abs(floats(lags["bits"]))
     sizes = sizes[sizes > 0]
-    floor = lags[lags["critical_value"].notna()]
     largest = sizes.max(initial=0)
-    small = np.abs(floats(floor["critical_value"])) if len(floor) else [min(sizes, default=1.0)]
-    linear = 10 ** np.round(np.log10(np.nanmax([largest / 100, *small, 1e-9])))
+    linear = 10 ** np.round(np.log10(np.nanmax([largest / 100, min(sizes, default=1.0), 1e-9])))
     if largest > 30 * linear:
         axes.set_yscale("symlog", linthresh=linear, linscale=0.6)
         axes.yaxis.set_major_formatter(DIGITS)
     curves = dict(iter(lags.groupby(lag_names(lags), sort=False)))
     for (name, own), (color, line) in zip(curves.items(), lines(list(curves)), strict=True):
         band(axes, own[["lag", "bits", "low", "high"]].to_numpy(), color, short(name, 40), line)
-    if len(floor):
-        axes.plot(
-            floor["lag"], floor["critical_value"], "--", color=INK, alpha=0.7, lw=1.2, label="independent actions"
-        )
     axes.axhline(0, color=INK, lw=0.8)
     whole_numbers(axes, "steps back", "bits")
     legend(figure, axes.get_legend_handles_labels()[0])

@@ -187,7 +187,7 @@ def _gains(arrays: Arrays, inputs: str) -> list[dict[str, Any]]:
         for lag in range(1, len(scores)):
             bits, low, high, _ = scores[lag - 1].minus(scores[lag])
             row = {"what": "gain", "model": name, "context": inputs, "lag": lag, "bits": bits, "low": low, "high": high}
-            rows.append(row | {"critical_value": None, "units": len(scores[lag].actions)})
+            rows.append(row | {"units": len(scores[lag].actions)})
     return rows
 
 

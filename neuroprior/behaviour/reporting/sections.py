@@ -12,7 +12,7 @@ from torch import Tensor
 from neuroprior._statistics import ENOUGH_UNITS, LEVEL
 from neuroprior.behaviour.analysis.comparison import never_occur, never_taken, too_few, unit_name, units
 from neuroprior.behaviour.analysis.drift import by_group, by_plan, by_position
-from neuroprior.behaviour.analysis.lags import mutual_information
+from neuroprior.behaviour.analysis.lags import how_far_back
 from neuroprior.behaviour.analysis.motifs import motifs
 from neuroprior.behaviour.analysis.rate_drift import rate_drift
 from neuroprior.behaviour.recorded_plans import RecordedPlans, action_names, group_names
@@ -21,7 +21,6 @@ from neuroprior.behaviour.reporting.conditions import condition_section
 from neuroprior.behaviour.reporting.document import Column, table
 from neuroprior.behaviour.reporting.durations import duration_section
 from neuroprior.behaviour.reporting.findings import Finding, p_words
-from neuroprior.behaviour.reporting.fits import ACTIONS
 from neuroprior.behaviour.reporting.individuals import individual_section
 from neuroprior.behaviour.reporting.modes import mode_section
 from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
@@ -31,10 +30,8 @@ from neuroprior.behaviour.reporting.scores import Evaluation
 from neuroprior.behaviour.reporting.transitions import transition_section
 from neuroprior.plans import Plans, constant_context, has_patterns
 
-MOST_LAG = 20
 LISTED_LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 20)
 BEGINNING = 5  # actions of a plan that do not count in drift
-LEAST = 1e-9  # bits: below, a gain is 0 but for rounding
 
 
 def file_section(found: Evaluation) -> Part:
@@ -147,42 +144,58 @@ def score_section(found: Evaluation) -> Part | None:
 
 def lag_section(found: Evaluation) -> Part | None:
     """How far back structure reaches."""
-    skip = found.settings["skip"]
-    lags = found.gains
-    if int(found.plans.mask()[:, max(skip, 1) :].sum()) >= 2:
-        information = pd.DataFrame(mutual_information(found.plans, MOST_LAG, skip, _shuffles()))
-        information = information.assign(what="mutual information", model="counts", context=ACTIONS, units=None)
-        lags = pd.concat([information, lags], ignore_index=True) if len(lags) else information
-        lags = lags[["what", "model", "context", "lag", "bits", "low", "high", "critical_value", "units"]]
-    if not len(lags):
+    try:
+        result = how_far_back(found.plans, skip=found.settings["skip"])
+    except ValueError:  # fewer than two plans with successive actions
+        result = None
+    if result is None and not len(found.gains):
         return None
-    lags = lags.assign(units=lags["units"].astype("Int64"))
-    few = too_few(found.plans)
-    above = (lags["units"].fillna(ENOUGH_UNITS) >= ENOUGH_UNITS) & (lags["low"] >= LEAST) & (not few)
-    cells = lags["bits"].map("{:.4f}".format) + above.map({True: "*", False: " "})
-    names = figures.lag_names(lags)
-    wide = lags.assign(cell=cells, curve=names).pivot(index="lag", columns="curve", values="cell")[names.unique()]
-    wide = wide[wide.index.isin(LISTED_LAGS)].reset_index()
-    columns = {name.replace(", ", "\n").replace("with context", "+ context"): name for name in wide.columns}
-    over = (
-        f"{unit_name(found.plans)} (gain: {unit_name(found.first_fold)} of the first fold, if there are {ENOUGH_UNITS})"
-    )
+    frames, tables, boxes = {"how_far_back": pd.DataFrame(), "lags": found.gains}, list[Table](), list[FigureBox]()
     text = [
-        "Mutual information: of two actions k steps apart, whatever lies between. Gain: how much the action k steps"
-        " back improves predictions beyond all nearer ones, in held-out plans of the first fold: a model that knows k"
-        " actions against one that knows k - 1, on the same actions (a Markov chain of that order with back-off; a"
-        " GRU that was trained on pieces of plans).",
-        "Where the gain of the chain ends before that of the GRU, longer histories matter but occur too seldom to be"
-        " counted; below 0, splitting the counts loses more than the older action adds.",
+        "Gain: how much the action k steps back improves predictions beyond all nearer ones. A Markov chain that knows"
+        " k actions is compared with one that knows k - 1, on actions of those whose others it learned from."
     ]
-    text += [without_verdict(few)] if few else []
-    caption = (
-        "Bits that the action k steps back adds. Dashed: the 95 % quantile of the mutual information of independent"
-        " actions."
-    )
-    box = FigureBox(figures.lag_figure(lags), caption, "Information by lag.", "lags")
-    shown = table(wide, columns, "Bits." if few else f"Bits. *: above 0, by the 95 % interval of that lag over {over}.")
-    return Part(Section("Information by lag", text, [shown], [box]), {"lags": lags})
+    findings, verdicts = list[Finding](), list[str]()
+    if result is not None:
+        frame = frames["how_far_back"] = result.frame()
+        findings, verdicts = _lag_findings(frame), [] if result.few else [result.verdict]
+        text += [without_verdict(result.few) or result.verdict]
+        columns: dict[str, Column] = {
+            "lag": "lag",
+            "bits": "bits:.4f",
+            "95 % interval": lambda row: f"{row.low:.4f} to {row.high:.4f}",
+            "p": lambda row: p_text(row.corrected) + "*" * row.adds,
+        }
+        caption = f"Bits that the action k steps back adds, over {result.unit}."
+        caption += "" if result.few else " p: of a gain at this lag and all before it. *: p < 0.05."
+        tables.append(table(frame, _without_p(columns, result.few), caption, "How far back"))
+    if len(found.gains):
+        lags = found.gains.assign(curve=figures.lag_names(found.gains), cell=found.gains["bits"].map("{:.4f}".format))
+        wide = lags.pivot(index="lag", columns="curve", values="cell")[lags["curve"].unique()]
+        wide = wide[wide.index.isin(LISTED_LAGS)].reset_index()
+        names = {name.replace(", ", "\n").replace("with context", "+ context"): name for name in wide.columns}
+        text.append(
+            "Longer lags, in held-out plans of the first fold alone: of chains, and of a GRU that was trained on pieces"
+            " of plans. Where the gain of the chain ends before that of the GRU, longer histories matter but occur too"
+            " seldom to be counted; below 0, splitting the counts loses more than the older action adds."
+        )
+        tables.append(table(wide, names, "Bits. Not tested: one fold is too little.", "Gain by lag"))
+        caption = f"Bits that the action k steps back adds; intervals over {unit_name(found.first_fold)} of one fold."
+        boxes = [FigureBox(figures.lag_figure(found.gains), caption, "Gain by lag.", "lags")]
+    return Part(Section("How far back", text, tables, boxes), frames, verdicts, findings)
+
+
+def _lag_findings(frame: pd.DataFrame) -> list[Finding]:
+    found = []
+    for row in frame.to_dict("records"):
+        gain, low, high, p, corrected = (float(row[what]) for what in ("bits", "low", "high", "p_value", "corrected"))
+        feature = f"lag {row['lag']}"
+        sentence = (
+            f"The behaviour {row['lag']} back adds {gain:.3g} bits to the prediction of the next one, 95 % interval"
+            f" {low:.3g} to {high:.3g}; {p_words(corrected)}."
+        )
+        found.append(Finding(feature, "lags", feature, gain, low, high, p, corrected, bool(row["adds"]), sentence))
+    return found
 
 
 def motif_section(found: Evaluation) -> Part | None:
@@ -361,11 +374,6 @@ def _num_contexts(plans: Plans) -> int | None:
     if plans.context is None or plans.context.is_floating_point() or not plans.context.numel():
         return None
     return int(plans.context.max()) + 1
-
-
-def _shuffles() -> torch.Generator:
-    """What permutation tests draw from: the same file gives the same report."""
-    return torch.Generator().manual_seed(0)
 
 
 def _input(row: Any) -> str:

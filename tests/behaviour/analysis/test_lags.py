@@ -1,6 +1,7 @@
-"""Information by lag against chains whose information is known, brute force and enumeration; pieces against slices."""
+"""How far back: gains counted by hand, closed forms, and simulations of known order; pieces against slices."""
 
 import math
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -8,141 +9,129 @@ import torch
 from scipy import stats
 
 from neuroprior import Plans
-from neuroprior.behaviour.analysis.lags import mutual_information, pieces
+from neuroprior.behaviour import Difference, HowFarBack, how_far_back, ratio_difference
+from neuroprior.behaviour.analysis.lags import pieces
 from neuroprior.plans.folds import BLOCKS
 from tests.support.sources import FALSE_ALARM, refuses, seeded
 
 
-def two_state(num: int, length: int, stay: float, generator: torch.Generator) -> Plans:
-    """Chains over two actions, each repeated with probability `stay`, begun at random: eigenvalue 2 `stay` - 1."""
-    moved = (torch.rand(num, length, generator=generator) >= stay).long()
-    moved[:, 0] = torch.randint(2, (num,), generator=generator)
-    return Plans(moved.cumsum(1) % 2, 2)
+def order_two(seed: int, mix: float, subjects: int = 10, length: int = 60) -> Plans:
+    """Two or three sessions a subject of unlike lengths: what comes next is by one action, or with `mix` by two."""
+    random = np.random.default_rng(seed)
+    one, two = random.dirichlet(np.ones(4) / 2, 4), random.dirichlet(np.ones(4) / 2, (4, 4))
+    probs = ((1 - mix) * one[None] + mix * two).cumsum(-1)
+    group = torch.arange(subjects).repeat_interleave(2 + torch.arange(subjects) % 2)
+    actions = random.integers(4, size=(len(group), length))
+    for t in range(2, length):
+        drawn = random.random((len(group), 1))
+        actions[:, t] = (probs[actions[:, t - 2], actions[:, t - 1]] < drawn).sum(-1).clip(max=3)
+    lengths = torch.from_numpy(random.integers(length // 2, length + 1, len(group)))
+    return Plans(torch.from_numpy(actions), 4, lengths, group=group)
 
 
-def known(stay: float, lag: int) -> float:
-    """1 - H(p) for the probability p of the same action again `lag` steps later."""
-    p = (1 + (2 * stay - 1) ** lag) / 2
-    return 1 + p * math.log2(p) + (1 - p) * math.log2(1 - p)
+def by_hand(plans: Plans, max_lag: int) -> list[tuple[list[float], list[int]]]:
+    """The gain and the actions of each subject, counted in plain loops."""
+    rows = [
+        (number, row[:length])
+        for number, row, length in zip(
+            plans.group.tolist(), plans.actions.tolist(), plans.lengths.tolist(), strict=True
+        )
+    ]
+    subjects = sorted({number for number, _ in rows})
+    prob = {}  # of each action by subject, plan, step: under the chain of the last order
+    found = []
+    for order in range(max_lag + 1):
+        new = {}
+        gain, size = dict.fromkeys(subjects, 0.0), dict.fromkeys(subjects, 0)
+        for own in subjects:
+            counts: Counter[tuple[tuple[int, ...], int]] = Counter()
+            for number, row in rows:
+                if number != own:
+                    counts.update((tuple(row[t - order : t]), row[t]) for t in range(order, len(row)))
+            totals: Counter[tuple[int, ...]] = Counter()
+            for (past, _), many in counts.items():
+                totals[past] += many
+
+            lower = {}
+            for place, (number, row) in enumerate(rows):
+                for t in range(order, len(row)):
+                    if order and number != own and (tuple(row[t - order : t]), row[t]) not in lower:
+                        lower[tuple(row[t - order : t]), row[t]] = prob[place, t]
+
+            def evidence(weight, counts=counts, totals=totals, lower=lower):
+                pairs = [(n, weight * lower[key]) for key, n in counts.items()]
+                each = [math.lgamma(n + some) - math.lgamma(some) for n, some in pairs]
+                return sum(each) + sum(math.lgamma(weight) - math.lgamma(n + weight) for n in totals.values())
+
+            weight = max((4.0**k for k in range(-6, 9)), key=evidence) if order else 4.0
+            for place, (number, row) in enumerate(rows):
+                for t in range(order, len(row)) if number == own else ():
+                    past = tuple(row[t - order : t])
+                    before = prob[place, t] if order else 0.25
+                    new[place, t] = (counts[past, row[t]] + weight * before) / (totals[past] + weight)
+                    if order:
+                        gain[own] += math.log2(new[place, t] / before)
+                        size[own] += 1
+        prob = prob | new
+        found.append((list(gain.values()), list(size.values())))
+    return found[1:]
 
 
-def plug_in(pairs: torch.Tensor, num_actions: int) -> float:
-    """The information of pairs `[M, 2]` in nats, from its definition."""
-    joint = np.zeros((num_actions, num_actions))
-    np.add.at(joint, (pairs[:, 0].numpy(), pairs[:, 1].numpy()), 1 / len(pairs))
-    apart = joint.sum(1, keepdims=True) * joint.sum(0, keepdims=True)
-    return float((joint[joint > 0] * np.log(joint[joint > 0] / apart[joint > 0])).sum())
+def test_gains_by_hand():
+    plans = order_two(3, 0.5, 4, 30)
+    result, want = how_far_back(plans, 3), by_hand(plans, 3)
+    for one, (gain, size) in zip(result.gains, want, strict=True):
+        assert one == pytest.approx(tuple(ratio_difference(gain, size)), abs=1e-7)
+    assert (result.unit, result.num_units) == ("groups", 4)
+    assert result.few == "4 groups are too few for a verdict"
+    assert not result.frame()["adds"].any()
 
 
-def test_two_states():
-    for found in mutual_information(two_state(2000, 100, 0.8, seeded(0)), 12, generator=seeded(1)):
-        truth = known(0.8, found.lag)
-        assert found.bits == pytest.approx(truth, abs=0.003), found.lag
-        assert found.bits > found.critical_value or truth < 1e-4, found.lag
-        assert found.pairs == 2000 * (100 - found.lag)
+def test_lags_are_tested_in_their_order():
+    """A lag after one without a gain does not count, however clear; nor does a loss."""
+    gains = [Difference(0.3, 0.2, 0.4, 1e-5), Difference(-0.3, -0.4, -0.2, 1e-5), Difference(0.3, 0.2, 0.4, 1e-9)]
+    some = HowFarBack(gains, np.array([1e-5, 1.0, 1.0]), 1, "groups", 9, "")
+    assert some.frame()["adds"].tolist() == [True, False, False]
+    assert some.verdict == "How far back: one behaviour; a second adds nothing (-.3 bits, -.4 to -.2)."
+    every = HowFarBack(gains[::2], np.array([1e-5, 1e-5]), 2, "groups", 9, "")
+    assert every.verdict == "How far back: two behaviours at least."
+    none = HowFarBack(gains[1:], np.array([1.0, 1.0]), 0, "groups", 9, "")
+    assert none.verdict == "How far back: no behaviour; the last adds nothing (-.3 bits, -.4 to -.2)."
 
 
-@pytest.mark.parametrize("num_actions", [3, 700])
-def test_bias_and_error_by_hand(num_actions):
-    """Against leaving out each plan and counting again; in a full table of 405 cells, or a sparse one of 22 million."""
-    generator = seeded(1)
-    lengths = torch.randint(2, 6, (45,), generator=generator)
-    plans = Plans(torch.randint(3, (45, 5), generator=generator), num_actions, lengths)
-    pairs = [torch.stack([a[: n - 1], a[1:n]], 1).long() for a, n in zip(plans.actions, lengths, strict=True)]
-    whole, m = plug_in(torch.cat(pairs), 3), np.array([len(p) for p in pairs])
-    without = np.array([plug_in(torch.cat(pairs[:i] + pairs[i + 1 :]), 3) for i in range(45)])
-    h = m.sum() / m
-    estimate = 45 * whole - ((1 - 1 / h) * without).sum()
-    pseudo = h * whole - (h - 1) * without
-    error = math.sqrt(((pseudo - estimate) ** 2 / (h - 1)).mean())
-    found = mutual_information(plans, 1, generator=seeded(1))[0]
-    assert found.bits == pytest.approx(estimate / math.log(2))
-    half = (found.high - found.low) / 2
-    assert half == pytest.approx(max(stats.t.ppf(0.975, 44) * error / math.log(2), found.critical_value))
-    assert found.pairs == m.sum()
+def test_an_action_that_is_known_from_the_last_one():
+    """Three in a cycle, begun at random: log2 3 bits at lag 1, and none further back."""
+    plans = Plans((torch.arange(30)[:, None] + torch.arange(301)) % 3, 3)
+    result = how_far_back(plans, 2)
+    assert result.gains[0].mean == pytest.approx(math.log2(3), abs=0.01)
+    assert result.gains[1].mean == pytest.approx(0, abs=1e-3)
+    assert result.reach == 1
 
 
-@pytest.mark.parametrize("phase", [torch.arange(30) % 3, torch.zeros(1).long()])
-def test_period_three(phase):
-    """Known from any one action: log2 3 bits at every lag, of many plans or of one."""
-    found = mutual_information(Plans((phase[:, None] + torch.arange(301)) % 3, 3), 20, generator=seeded(1))
-    assert [one.lag for one in found] == list(range(1, 21))
-    for one in found:
-        assert one.bits == pytest.approx(math.log2(3), abs=1e-3)
-        assert one.low <= math.log2(3) + 1e-3
-        assert one.high - one.low < 0.01
+def test_what_is_not_there_is_seldom_found_and_what_is_there_is():
+    """At most 5 % of order-1 studies reach further; of order-2 studies, in which lag 2 adds some .05 bits, 80 % do."""
+    reach = [how_far_back(order_two(seed, 0.0)).reach for seed in range(60)]
+    assert sum(one > 1 for one in reach) <= stats.binom.isf(FALSE_ALARM, 60, 0.05)
+    assert min(reach) == 1
+    further = [how_far_back(order_two(seed, 0.35)).reach >= 2 for seed in range(60)]
+    assert sum(further) >= stats.binom.ppf(0.5, 60, 0.8)
 
 
-@pytest.mark.parametrize(("actions", "num", "length"), [(2, 1, 400), (5, 40, 20), (40, 10, 60)])
-def test_independent_actions(actions, num, length):
-    """About one set of twenty exceeds the critical value (also with 1,600 cells for 590 pairs); intervals hold 0."""
-    generator, above, covered = seeded(actions), 0, 0
-    sets = 200 if actions < 40 else 40
-    for _ in range(sets):
-        plans = Plans(torch.randint(actions, (num, length), generator=generator), actions)
-        found = mutual_information(plans, 1, generator=generator)[0]
-        above += found.bits > found.critical_value
-        covered += found.low <= 0 <= found.high
-    # The level is approximate: between 2 and 9 % is allowed.
-    assert stats.binom.ppf(FALSE_ALARM, sets, 0.02) <= above <= stats.binom.isf(FALSE_ALARM, sets, 0.09)
-    assert covered >= stats.binom.ppf(FALSE_ALARM, sets, 0.95)
-
-
-def test_critical_value_of_a_chain():
-    """At lag 12 a chain of eigenvalue e = 0.6 has no information, but (1 + e**2) / (1 - e**2) times the usual bias."""
-    generator, above, critical = seeded(3), 0, []
-    for _ in range(60):
-        found = mutual_information(two_state(50, 72, 0.8, generator), 12, 12, generator)[11]
-        above += found.bits > found.critical_value
-        critical.append(found.critical_value * 2 * found.pairs * math.log(2) / (stats.chi2.ppf(0.95, 1) - 1))
-    assert np.mean(critical) == pytest.approx(1.36 / 0.64, rel=0.15)
-    assert above <= stats.binom.isf(FALSE_ALARM, 60, 0.09)
-
-
-@pytest.mark.parametrize(("num", "length"), [(60, 30), (1, 1500)])
-def test_intervals_cover_at_about_their_level(num, length):
-    generator, hits = seeded(4), np.zeros(3)
-    for _ in range(200):
-        found = mutual_information(two_state(num, length, 0.75, generator), 3, generator=generator)
-        hits += [one.low <= known(0.75, one.lag) <= one.high for one in found]
-    assert (hits >= stats.binom.ppf(FALSE_ALARM, 200, 0.9)).all()
-
-
-@pytest.mark.parametrize(("pairs", "few"), [(319, True), (320, False)])
-def test_few_pairs_are_shuffled(pairs, few):
-    """Fewer than 20 for each of the 4 x 4 degrees of freedom of five actions."""
-    actions = torch.randint(5, (1, pairs + 1), generator=seeded(0))
-    generator = seeded(1)
-    found = mutual_information(Plans(actions, 5), 1, generator=generator)[0]
-    assert found.pairs == pairs
-    assert (not generator.get_state().equal(seeded(1).get_state())) == few
-
-
-def test_lags_end_where_pairs_end():
-    plans = Plans(torch.randint(2, (3, 6), generator=seeded(0)), 2, torch.tensor([6, 4, 1]))
-    assert [one.pairs for one in mutual_information(plans)] == [8, 6, 4, 2]
-    assert [one.pairs for one in mutual_information(plans, 3, skip=3)] == [4, 4, 4]
-    # Numbers of groups without pairs leave no empty block.
-    group = torch.arange(402) * 200
-    many = Plans(torch.randint(2, (402, 3), generator=seeded(0)), 2, torch.where(group % 40200 == 0, 3, 1), group=group)
-    assert [one.pairs for one in mutual_information(many)] == [4, 2]
-    for wrong in (plans[2:], plans[:0], Plans(torch.zeros(1, 2).long(), 2)):
-        with refuses("plans", "two pairs"):
-            mutual_information(wrong)
-    with refuses("skip"):
-        mutual_information(plans, skip=-1)
+def test_plans_of_one_subject_or_without_pairs_are_refused():
+    with refuses("`plans` must have two units with successive actions after the first 0, got fewer"):
+        how_far_back(Plans(torch.zeros(1, 9, dtype=torch.long), 2))
+    with refuses("two units", "after the first 9"):
+        how_far_back(Plans(torch.zeros(5, 9, dtype=torch.long), 2), skip=9)
     with refuses("max_lag"):
-        mutual_information(plans, 0)
+        how_far_back(order_two(0, 0.0), 0)
+    with refuses("skip"):
+        how_far_back(order_two(0, 0.0), skip=-1)
 
 
-def test_groups_are_the_units():
-    """Four groups of which each acts in its own way: wide intervals, and the same estimate."""
-    plans = [two_state(30, 20, stay, seeded(5)).actions for stay in (0.6, 0.7, 0.9, 0.95)]
-    alone = Plans(torch.cat(plans), 2)
-    grouped = Plans(torch.cat(plans), 2, group=torch.arange(120) // 30)
-    one, other = (mutual_information(some, 1, generator=seeded(1))[0] for some in (alone, grouped))
-    assert one.bits == other.bits
-    assert other.high - other.low > 2 * (one.high - one.low)
+def test_lags_end_where_plans_do():
+    plans = Plans(torch.randint(2, (6, 3), generator=seeded(0)), 2, torch.tensor([3, 2, 3, 1, 2, 3]))
+    assert len(how_far_back(plans).gains) == 2
+    assert how_far_back(plans, skip=2).frame()["units"].tolist() == [6, 6]
 
 
 def numbered(**more) -> Plans:
@@ -221,13 +210,3 @@ def test_pieces_bad_input():
     for length, most in ((0, 1), (1, 0)):
         with refuses("most" if length else "length"):
             pieces(numbered(), length, most)
-
-
-def test_of_few_pairs_that_depend_the_information_is_above_what_shuffled_ones_give():
-    """Twenty actions in a fixed cycle, 140 pairs: all is known of the next, and no shuffle comes near."""
-    actions = (torch.arange(20)[:, None] + torch.arange(8)) % 20
-    found = mutual_information(Plans(actions, 20), 2, generator=seeded(0))
-    for one in found:
-        assert one.bits > 2
-        assert 0 < one.critical_value < one.bits
-        assert one.low > 0

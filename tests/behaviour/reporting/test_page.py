@@ -91,10 +91,9 @@ def scores(models: list[str], context: bool) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["model", "context", "bits_per_action", "low", "high"])
 
 
-def lags(curves: dict[str, list[tuple]], floor: dict[int, float] | None = None) -> pd.DataFrame:
-    rows = [("gain", model, "actions", *row, None) for model, rows in curves.items() for row in rows]
-    rows += [("mutual information", "counts", "actions", lag, None, None, None, b) for lag, b in (floor or {}).items()]
-    return pd.DataFrame(rows, columns=["what", "model", "context", "lag", "bits", "low", "high", "critical_value"])
+def lags(curves: dict[str, list[tuple]]) -> pd.DataFrame:
+    rows = [(model, "actions", *row) for model, rows in curves.items() for row in rows]
+    return pd.DataFrame(rows, columns=["model", "context", "lag", "bits", "low", "high"])
 
 
 def matrix(names: list[str], seed: int = 0) -> np.ndarray:
@@ -124,7 +123,7 @@ def figures(names: list[str], models: list[str], groups: list[str], context: boo
     drift += [("group", group, *estimate(1)) for group in groups]
     return {
         "score": score_figure(ranked),
-        "lag": lag_figure(lags(dict.fromkeys(models, steps), {1: 0.01})),
+        "lag": lag_figure(lags(dict.fromkeys(models, steps))),
         "one lag": lag_figure(lags({models[0]: [(1, 0.0, -0.1, 0.1)]})),
         "motif": motif_figure(motifs.assign(sequence=" > ".join(names[:6]), count=1200)),
         "drift": drift_figure(
@@ -300,7 +299,7 @@ def test_scores_stand_where_they_are():
 
 def test_lags_are_on_a_linear_axis_unless_they_span_decades():
     narrow = lag_figure(lags({"counts": [(1, 0.5, 0.4, 0.6), (2, 0.4, 0.3, 0.5)]}))
-    wide = lag_figure(lags({"counts": [(1, 0.5, 0.4, 0.6), (2, -0.0001, -0.001, 0.001)]}, {1: 0.001}))
+    wide = lag_figure(lags({"counts": [(1, 0.5, 0.4, 0.6), (2, -0.0001, -0.001, 0.001)]}))
     assert [figure.axes[0].get_yscale() for figure in (narrow, wide)] == ["linear", "symlog"]
     assert wide.axes[0].lines[0].get_xydata().tolist() == [[1, 0.5], [2, -0.0001]]
     low, high = wide.axes[0].get_ylim()

@@ -17,8 +17,8 @@ from neuroprior.behaviour import (
     by_group,
     by_plan,
     by_position,
+    how_far_back,
     motifs,
-    mutual_information,
 )
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.reporting.conditions import condition_section
@@ -129,13 +129,14 @@ def test_scores_with_their_intervals(found):
 
 
 @pytest.mark.parametrize("skip", [0, 2])
-def test_mutual_information_is_that_after_what_does_not_count(plans, skip):
+def test_how_far_back_is_of_what_counts(plans, skip):
     part = lag_section(evaluate_saved({"uniform": UniformPrior(3)}, plans, skip))
-    frame = part.frames["lags"]
-    want = pd.DataFrame(mutual_information(plans, 20, skip, seeded(0)))
-    for name in ("bits", "low", "high", "critical_value", "lag"):
-        assert frame[name].tolist() == want[name].tolist()
-    assert lag_section(evaluate_saved({"uniform": UniformPrior(3)}, plans[LENGTHS > 5], 3)) is not None
+    result = how_far_back(plans, skip=skip)
+    pd.testing.assert_frame_equal(part.frames["how_far_back"], result.frame())
+    assert part.verdicts == [result.verdict]
+    assert [one.starred for one in part.findings] == result.frame()["adds"].tolist()
+    assert [row[-1].endswith("*") for row in cells(part)] == result.frame()["adds"].tolist()
+    assert [one.p_corrected for one in part.findings] == result.corrected.tolist()
 
 
 def test_where_no_pair_of_actions_counts_there_is_no_section():

@@ -32,18 +32,14 @@ def found_in(plans: Plans):
     return evaluate_saved({"uniform": UniformPrior(plans.num_actions)}, RecordedPlans.of(plans), 0)
 
 
-def test_gains_are_starred_where_their_interval_is_above_0():
-    """And where there are enough units; a gain of 0 but for rounding is none."""
-    rows = [(1, 0.3, 0.1, 0.5, 5), (2, 0.3, -0.1, 0.7, 5), (3, 0.3, 0.1, 0.5, 4), (4, 1e-9, 1e-10, 1e-8, 9)]
-    rows.append((6, 0.2, 0.01, 0.3, 9))
-    gains = pd.DataFrame(rows, columns=["lag", "bits", "low", "high", "units"])
-    gains = gains.assign(what="gain", model="markov", context="actions", critical_value=None)
+def test_gains_of_one_fold_are_shown_and_not_starred():
+    gains = pd.DataFrame([(1, 0.3, 0.1, 0.5, 9), (5, 0.1, 0.05, 0.2, 9), (6, 0.2, 0.1, 0.3, 9)])
+    gains.columns = ["lag", "bits", "low", "high", "units"]
     plans = Plans(torch.randint(3, (12, 8), generator=seeded(0)), 3)
-    (table,) = lag_section(replace(found_in(plans), gains=gains)).section.tables
-    place = [heading.replace("\n", " ") for heading in table.headings].index("gain, markov".replace(", ", " "))
-    shown = {row[0]: row[place] for row in table.rows if row[place]}
-    want = {"1": "0.3000*", "2": "0.3000", "3": "0.3000", "4": "0.0000", "6": "0.2000*"}
-    assert {lag: cell.strip() for lag, cell in shown.items()} == want
+    part = lag_section(replace(found_in(plans), gains=gains.assign(what="gain", model="markov", context="actions")))
+    assert part.section.tables[-1].rows == [["1", "0.3000"], ["6", "0.2000"]]  # lag 5 is in the file alone
+    assert [figure.name for figure in part.section.figures] == ["lags"]
+    assert not any(one.starred for one in part.findings)
 
 
 @pytest.mark.parametrize(("animals", "starred"), [(6, ["run", "dig", "eat"]), (4, [])])
@@ -84,7 +80,7 @@ def made() -> Document:
 
 def test_a_report_has_its_tables_and_figures(made):
     assert {*made.tables, "motifs"} == {
-        *("plans", "actions", "lags", "transitions", "transition_test"),
+        *("plans", "actions", "how_far_back", "lags", "transitions", "transition_test"),
         *("motifs", "drift", "drift_tests", "rate_drift"),
         *("individuals", "individual_budget", "individual_types"),
     }
@@ -103,10 +99,10 @@ def test_what_is_asked_for_is_done(made):
 
 def test_the_lead_names_the_best_model(made):
     best = made.tables["plans"].sort_values("bits_per_action").iloc[0]
-    assert made.said[0] == (
+    assert (
         f"The best model, {best.model}, takes {best.bits_per_action:.3f} bits per action"
         f" (95 % interval {best.low:.3f} to {best.high:.3f} over groups)."
-    )
+    ) in made.said
 
 
 def test_plans_in_memory_and_in_a_file_have_the_same_report(tmp_path, made):
