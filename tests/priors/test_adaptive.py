@@ -162,8 +162,9 @@ def test_earlier_sequences_are_handed_on(tmp_path):
     due = [(3 + 2 / 3) / 7, (3 / 2 + 1 + 2 / 3) / (5 / 2 + 1 + 2), (2 / 4 + 2 / 3) / (5 / 4 + 3 / 2 + 2)]
     assert fading.action_log_probs(torch.tensor([[0, 0, 1]])).exp()[0].tolist() == pytest.approx(due)
     # Nothing is known of what followed two actions before there are two.
-    late = AdaptivePrior(UniformPrior(3), [inf, inf, 0.1]).adapted_to(first).action_log_probs(torch.tensor([[0, 1, 1]]))
-    assert late.exp()[0].tolist() == pytest.approx([1 / 3, 1 / 3, (1 + 0.1 / 3) / 1.1])
+    late = AdaptivePrior(UniformPrior(3), [inf, inf, 0.1]).adapted_to(torch.tensor([[0, 0, 2]]))
+    probs = late.action_log_probs(torch.tensor([[2, 0, 0, 2]])).exp()[0].tolist()
+    assert probs == pytest.approx([1 / 3, 1 / 3, 1 / 3, (1 + 0.1 / 3) / 1.1])
     # Histories of two actions, in plans of unequal lengths; padding says nothing.
     prior = AdaptivePrior(MarkovPrior(3, 1).fit(SKEWED), [inf, 2.0, 0.5], 0.5)
     some = Plans(torch.tensor([[0, 1, 2, 1], [1, 2, 2, 2], [0, 0, 0, 0]]), 3, torch.tensor([4, 3, 1]))
