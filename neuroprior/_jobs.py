@@ -222,7 +222,7 @@ def _unordered(
     if dask is not None:
         yield from _on_cluster(call, jobs, dask)
         return
-    if processes == 1 or len(jobs) == 1:
+    if processes == 1 or len(jobs) <= 1:
         yield from (call(job, index) for index, job in enumerate(jobs))
         return
     from joblib import Parallel, delayed, parallel_config

@@ -33,6 +33,10 @@ def test_results_come_in_the_order_of_the_jobs(processes: int, tmp_path: Path, c
     assert lines[-1].endswith(" 0:00:00 left)")
 
 
+def test_where_there_is_nothing_to_do_no_process_is_started() -> None:
+    assert list(_jobs.each_result(jobs.square, [], 2)) == []
+
+
 def test_finished_jobs_are_not_done_again(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     traces = tmp_path / "traces"
     traces.mkdir()

@@ -15,8 +15,14 @@ from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import folds, num_units
 from neuroprior.priors.construction import as_prior, described
-from neuroprior.priors.ensembles.mixture import divided
-from neuroprior.priors.learning import counted_plans, known_plans, plans_for, training_plans, validation_plans
+from neuroprior.priors.learning import (
+    counted_plans,
+    known_plans,
+    plans_for,
+    split_validation,
+    training_plans,
+    validation_plans,
+)
 from neuroprior.priors.prior import Prior
 from neuroprior.sampling.states import State
 
@@ -209,7 +215,7 @@ class AdaptivePrior(Prior):
         if self.fit_settings:
             given = settings.pop("validation", None)
             given = validation_plans(self, given) if isinstance(given, Plans) else given
-            learned, held_out = divided(plans, given, generator)
+            learned, held_out = split_validation(plans, given, generator)
             known = {"validation": held_out, **settings}
             self.base.fit(plans_for(self.base, learned), generator=generator, **known)
             self.learn_concentrations([(self.base, held_out)])

@@ -5,11 +5,15 @@ from torch import Tensor
 
 from neuroprior._checks import check_same_names, is_integer, warn_caller
 from neuroprior.plans import Plans, constant_context
+from neuroprior.plans.folds import check_alike, fair_split, ungrouped
 from neuroprior.plans.plans import AnyPlans
 from neuroprior.priors.prior import Prior, check_actions
 
 MOST_NEW, FEWEST_PLANS = 0.9, 20
 """A context is no category where so large a share of the actions has one that no other of so many plans has."""
+
+MOST_HELD_OUT, LEAST_HELD_OUT, LARGEST_HELD_OUT = 0.1, 0.02, 5000
+"""The share of plans that is held out to learn what experts do not: `LARGEST_HELD_OUT` actions, within these shares."""
 
 
 def training_plans(prior: Prior, plans: Plans | Tensor, *, further: bool = False) -> Plans:
@@ -125,3 +129,24 @@ def _seldom_repeats(prior: Prior, plans: Plans) -> bool:
     _, place, num_plans = pairs[:, 0].unique(return_inverse=True, return_counts=True)
     alone = torch.isin(context, pairs[num_plans[place] == 1, 0])
     return float(alone.double().mean()) > MOST_NEW
+
+
+def split_validation(plans: Plans, validation: Plans | float | None, generator: torch.Generator) -> tuple[Plans, Plans]:
+    """The plans that experts learn from, and those on which networks are stopped and weights are learned.
+
+    Groups stay together where there are so many that few actions are lost; see `fair_split`.
+
+    Raises:
+        ValueError: there are too few plans, or the validation plans are not numbered alike.
+    """
+    if isinstance(validation, Plans):
+        check_alike(plans, validation)
+        if not bool(validation.mask().any()):
+            raise ValueError("`validation` must have at least one plan with an action")
+        return plans, validation
+    plans = plans[plans.mask().any(1)]
+    if validation is None:
+        validation = min(MOST_HELD_OUT, max(LARGEST_HELD_OUT / max(int(plans.mask().sum()), 1), LEAST_HELD_OUT))
+    if plans.group is not None and 1 / len(plans.group.unique()) > 2 * validation:
+        plans = ungrouped(plans)
+    return fair_split(plans, validation, generator, divide_groups=True)

@@ -21,8 +21,7 @@ from neuroprior.priors.construction import construct, context_arguments
 from neuroprior.priors.counts import TooLargeError
 from neuroprior.priors.ensembles import candidates
 from neuroprior.priors.ensembles.candidates import Effort, fitted_experts, number_tried
-from neuroprior.priors.ensembles.mixture import divided
-from neuroprior.priors.learning import plans_for
+from neuroprior.priors.learning import plans_for, split_validation
 
 Arrays = dict[str, np.ndarray[Any, Any]]
 
@@ -158,7 +157,7 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: Design, seed: int)
                 # Chosen on the validation plans; then these are learned from as well.
                 yield baseline.model, baseline.how, baseline.prior.fit(plans_for(baseline.prior, learned))
     elif kind == COMBINED:
-        training, validation = divided(learned, None, generator)
+        training, validation = split_validation(learned, None, generator)
         experts = list(fitted_experts(training, validation, sizes, design.effort, generator, design.training))
         combined = construct(partial(CombinedPrior, experts=experts), learned.num_actions, sizes)
         assert isinstance(combined, CombinedPrior)

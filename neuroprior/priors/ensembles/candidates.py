@@ -1,6 +1,7 @@
 """The experts of a combined prior: which are tried on plans of a kind, and what is spent on them."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from copy import deepcopy
 from math import inf
 from typing import Any, Literal
 
@@ -9,6 +10,7 @@ import torch
 from neuroprior._random import draw_seed
 from neuroprior.plans.folds import divisible, folds, in_parts, num_units, pieces, ungrouped
 from neuroprior.plans.plans import Plans
+from neuroprior.priors.adaptive import AdaptivePrior
 from neuroprior.priors.construction import construct
 from neuroprior.priors.counts import BACKOFFS_TRIED, Chains, ContextTreePrior, MarkovPrior, TooLargeError
 from neuroprior.priors.ensembles.stacked import StackedPrior
@@ -41,6 +43,12 @@ LEAST_REST = 0.4
 
 PIECES = 10
 """Where some plans are too long for that, plans are cut into pieces of at most the actions divided by this."""
+
+LONG = 100
+"""Mean number of actions of plans from which on priors that follow the individual are tried."""
+
+LEVELS = (10.0, 10.0, 10.0)
+"""Where the search of their concentrations begins: at histories of none to two actions."""
 
 DEPTH = 10
 """Depth of the context trees among experts and baselines."""
@@ -89,6 +97,8 @@ def networks(num_actions: int, contexts: dict[str, int], effort: Effort, seed: i
 def counted(learned: Plans, held_out: Plans, contexts: dict[str, int]) -> Iterator[Prior]:
     """The experts that count, fitted to `learned`: a uniform prior, and a chain and a context tree of each context.
 
+    Where plans are long, a chain and a tree without context that follow the individual, too.
+
     Args:
         learned: plans to count in.
         held_out: plans on which the orders and back-offs of chains are chosen.
@@ -96,15 +106,21 @@ def counted(learned: Plans, held_out: Plans, contexts: dict[str, int]) -> Iterat
     """
     num_contexts, parts = contexts.get("num_contexts"), counting_parts(learned, held_out)
     yield UniformPrior(learned.num_actions).fit(learned.without_context())
+    simple: list[Prior] = []
     for number in [None] if num_contexts is None else [None, num_contexts]:
         found = best_chain(parts, number)
         if found is not None:
-            yield found
+            simple.append(found)
         try:
             tree = ContextTreePrior(learned.num_actions, DEPTH, num_contexts=number)
-            yield tree.fit(plans_for(tree, learned))
+            simple.append(tree.fit(plans_for(tree, learned)))
         except TooLargeError:
             continue
+    yield from simple
+    if int(learned.mask().sum()) >= LONG * len(learned):
+        for base in simple:
+            if not base.takes_context:
+                yield AdaptivePrior(deepcopy(base), LEVELS).fit(learned.without_context())
 
 
 def counting_parts(learned: Plans, held_out: Plans) -> list[tuple[Plans, Plans]]:

@@ -9,18 +9,21 @@ from torch import Tensor, nn
 from neuroprior._checks import check_alike_named, check_share
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
-from neuroprior.plans.folds import check_alike, fair_split, ungrouped
 from neuroprior.priors.construction import as_prior, described
 from neuroprior.priors.ensembles.stacked import context_for
-from neuroprior.priors.learning import counted_plans, known_plans, plans_for, training_plans, validation_plans
+from neuroprior.priors.learning import (
+    counted_plans,
+    known_plans,
+    plans_for,
+    split_validation,
+    training_plans,
+    validation_plans,
+)
 from neuroprior.priors.prior import Prior, taken_of
 from neuroprior.sampling.states import State
 
 SHARES = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Candidates for the share; `fit` takes the best."""
-
-MOST, LARGEST, LEAST = 0.1, 5000, 0.02
-"""The share of plans that is held out to learn the weights: `LARGEST` actions, but from `LEAST` to `MOST` of them."""
 
 STEPS = 50
 """Steps of expectation maximisation, which learns the weights."""
@@ -158,7 +161,7 @@ class MixturePrior(Prior):
         self.check_settings(settings)
         plans = training_plans(self, plans)
         generator = generator_on(generator, "cpu")
-        learned, held_out = divided(plans, self._validation_of(settings), generator)
+        learned, held_out = split_validation(plans, self._validation_of(settings), generator)
         self.fit_experts(learned, held_out, generator, settings)
         self.learn_weights(held_out)
         return self.recount(plans)
@@ -265,27 +268,6 @@ def learned_weights(taken: Tensor, mask: Tensor, steps: int = STEPS) -> tuple[Te
             posterior = joint.softmax(-1)[mask] if share else whole.softmax(-1)
             first = posterior.mean(0).clamp(min=1e-6).log().log_softmax(-1)
     return best[1], best[2]
-
-
-def divided(plans: Plans, validation: Plans | float | None, generator: torch.Generator) -> tuple[Plans, Plans]:
-    """The plans that experts learn from, and those on which networks are stopped and weights are learned.
-
-    Groups stay together where there are so many that few actions are lost; see `fair_split`.
-
-    Raises:
-        ValueError: there are too few plans, or the validation plans are not numbered alike.
-    """
-    if isinstance(validation, Plans):
-        check_alike(plans, validation)
-        if not bool(validation.mask().any()):
-            raise ValueError("`validation` must have at least one plan with an action")
-        return plans, validation
-    plans = plans[plans.mask().any(1)]
-    if validation is None:
-        validation = min(MOST, max(LARGEST / max(int(plans.mask().sum()), 1), LEAST))
-    if plans.group is not None and 1 / len(plans.group.unique()) > 2 * validation:
-        plans = ungrouped(plans)
-    return fair_split(plans, validation, generator, divide_groups=True)
 
 
 def mixed(weights: Tensor, forecasts: Tensor) -> Tensor:

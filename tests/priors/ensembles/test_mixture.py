@@ -8,7 +8,7 @@ import torch
 
 from neuroprior import ContextTreePrior, GRUPrior, MarkovPrior, Plans, TransformerPrior, UniformPrior, load, save
 from neuroprior.priors import MixturePrior, StackedPrior
-from neuroprior.priors.ensembles.mixture import divided
+from neuroprior.priors.learning import split_validation
 from neuroprior.testing import check_prior
 from tests.support.sources import every_plan, seeded
 
@@ -159,12 +159,12 @@ def test_experts_that_do_not_fit(made, more, word):
 def test_the_share_held_out_is_a_tenth_of_few_plans_and_a_fiftieth_of_many(length, held_out):
     """5,000 actions between these; of 1,000 plans of so many actions."""
     plans = Plans(torch.zeros(1000, length, dtype=torch.uint8), 2)
-    learned, chosen_on = divided(plans, None, seeded(0))
+    learned, chosen_on = split_validation(plans, None, seeded(0))
     assert (len(learned), len(chosen_on)) == (1000 - held_out, held_out)
 
 
 def test_plans_without_actions_are_not_held_out():
     """Of 40 plans 10 have actions: of these, half are held out, and none is left for another 30."""
     lengths = torch.where(torch.arange(40) % 4 == 0, 3, 0)
-    parts = divided(Plans(torch.randint(A, (40, 3), generator=seeded(0)), A, lengths), 0.5, seeded(0))
+    parts = split_validation(Plans(torch.randint(A, (40, 3), generator=seeded(0)), A, lengths), 0.5, seeded(0))
     assert [part.mask().sum(1).tolist() for part in parts] == [[3] * 5] * 2

@@ -12,7 +12,8 @@ from neuroprior.priors.counts import BACKOFFS_TRIED, Chains, HistoryPrior
 from neuroprior.priors.ensembles import stacked
 from neuroprior.priors.ensembles.candidates import NETWORKS, ORDERS, best_chain, counting_parts, fitted_experts
 from neuroprior.priors.ensembles.combined import HeldOut
-from neuroprior.priors.ensembles.mixture import SHARES, divided
+from neuroprior.priors.ensembles.mixture import SHARES
+from neuroprior.priors.learning import split_validation
 from tests.support.sources import seeded
 
 A = 3
@@ -180,7 +181,7 @@ def test_of_many_plans_a_network_has_to_be_clearly_better_too():
 def test_groups_stay_together_where_they_are_many():
     for number, whole in ((40, True), (20, True), (4, False)):
         plans = some_plans(80, group=torch.arange(80) % number)
-        parts = divided(plans, None, seeded(0))
+        parts = split_validation(plans, None, seeded(0))
         assert all((part.group is not None) == whole for part in parts)
         if whole:
             assert not set(parts[0].group.tolist()) & set(parts[1].group.tolist())

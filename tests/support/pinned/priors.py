@@ -207,7 +207,7 @@ def fitted_by_name():
     plans, found = timed(16, 8), {}
     for name in PRIORS:
         quick = {} if name in ("uniform", "markov", "context-tree", "semi-markov", "switching") else QUICK
-        if name not in ("combined", "mixture", "stacked"):
+        if name not in ("adaptive", "combined", "mixture", "stacked"):
             prior = fit(plans, name, generator=seeded(0), **quick)
             found[name] = [
                 prior.config,
