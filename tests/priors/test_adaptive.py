@@ -114,6 +114,18 @@ def test_it_predicts_individuals_as_well_as_bayes():
     assert base > loss + 0.03
 
 
+def test_the_combined_prior_follows_individuals_where_plans_are_long():
+    """Its expert that follows them is what it keeps; short plans say nothing of an individual."""
+    (learned, rows), (new, _) = individuals(40, 400, 10.0, 6), individuals(20, 400, 10.0, 7)
+    settings = {"effort": "fast", "max_steps": 5, "progress": False}
+    prior = fit(learned, generator=seeded(0), **settings)
+    assert any(isinstance(expert, AdaptivePrior) for expert in prior.experts)
+    loss = -float(prior.action_log_probs(new)[:, 1:].sum()) / float((new.lengths - 1).sum())
+    assert loss < exact(new, rows, 10.0) + 0.005
+    short = fit(individuals(40, 90, 10.0, 6)[0], generator=seeded(0), **settings)
+    assert not any(isinstance(expert, AdaptivePrior) for expert in (*short.experts, *short.spare))
+
+
 def test_where_individuals_are_alike_it_is_its_base():
     probs = torch.tensor([[0.1, 0.7, 0.2], [0.5, 0.2, 0.3], [0.3, 0.3, 0.4]]).log()
     actions = torch.zeros(50, 200, dtype=torch.long)
