@@ -68,7 +68,8 @@ class CombinedPrior(MixturePrior):
     """Experts of every kind as one prior, which is hardly ever behind the best of them.
 
     The experts are priors that count (uniform, Markov chains and context trees, with and without the context; where
-    plans are long, also such that follow the individual, see `AdaptivePrior`) and networks. Of their forecasts p_e, three kinds of forecast are mixed:
+    plans are long, also such that follow the individual, see `AdaptivePrior`) and networks. Of their forecasts p_e,
+    three kinds of forecast are mixed:
 
     - each expert's own;
     - the pool, proportional to the product of all p_e ** power_e (the logarithmic opinion pool: Genest and Zidek 1986;
