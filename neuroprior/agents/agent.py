@@ -14,7 +14,7 @@ from neuroprior.planners.execution import Change, check_change, follow, join_exe
 from neuroprior.planners.planner import check_is_planner
 from neuroprior.planners.warm_start import with_rest
 from neuroprior.plans import Plans
-from neuroprior.priors import CombinedPrior, Prior
+from neuroprior.priors import AdaptivePrior, CombinedPrior, Prior
 from neuroprior.priors.prior import check_is_prior
 from neuroprior.sampling.stepping import check_actions
 from neuroprior.worlds.world import World, check_is_world, is_over
@@ -44,7 +44,9 @@ class Agent:
     plans of `plan_length` actions, fewer where an episode ends, which go into a `Replay`. Every `learn_every` steps
     some of the stored plans are forgotten, and the prior is fitted to the rest: count-based priors anew, so that their
     counts decay exponentially; neural ones from their present weights. The prior is fitted in place, so that a planner
-    with the same prior changes along. It is not fitted to fewer than two plans.
+    with the same prior changes along. It is not fitted to fewer than two plans. An `AdaptivePrior` is not fitted at
+    all: it counts each stored plan at once, and every `learn_every` steps its earlier counts are multiplied by
+    `retention`.
 
     Args:
         world: the world.
@@ -191,15 +193,19 @@ class Agent:
         self.recent.append(steps)
         if self.time % self.plan_length:
             return
-        self._store()
+        stored = self._store()
         self.recent = []
-        if self.time % self.learn_every == 0:
+        due = self.time % self.learn_every == 0
+        if due:
             self.replay.forget(self.generator)
-            if self.replay.plans is not None and len(self.replay) > 1:
-                self.prior.fit(self.replay.plans, generator=self.generator, **self.training)
+        if isinstance(self.prior, AdaptivePrior):
+            if stored is not None:
+                self.prior.count(stored, self.replay.retention if due else 1.0)
+        elif due and self.replay.plans is not None and len(self.replay) > 1:
+            self.prior.fit(self.replay.plans, generator=self.generator, **self.training)
 
-    def _store(self) -> None:
-        """Store the plans that were executed recently: of each agent one for each episode that it was in."""
+    def _store(self) -> Plans | None:
+        """Store, and return, the plans that were executed recently: of each agent one for each episode it was in."""
         before, actions, rewards = (
             torch.cat([getattr(steps, name) for steps in self.recent], 1) for name in ("before", "actions", "rewards")
         )
@@ -217,8 +223,9 @@ class Agent:
         if self.min_score is not None:
             kept &= score > self.min_score
         if not kept.any():
-            return
+            return None
         place = row[kept, None], (first[kept, None] + time).clamp(max=actions.shape[1] - 1)
         context = observations(self.world, before[place], self.prior.context_per)
         plans = Plans(actions[place], self.world.num_actions, lengths[kept], self.world.action_names, context)
         self.replay.add(plans)
+        return plans

@@ -264,25 +264,31 @@ class AdaptivePrior(Prior):
     def adapted_to(self, plans: Plans | Tensor) -> "AdaptivePrior":
         """Return a copy that begins each sequence with the counts of an individual's earlier ones.
 
-        Its counts add up: `prior.adapted_to(first).adapted_to(second)` has counted in both. Nothing fades within
-        `plans`.
+        Its counts add up: `prior.adapted_to(first).adapted_to(second)` has counted in both. See `count`.
+        """
+        adapted = deepcopy(self)
+        adapted.count(plans)
+        return adapted
+
+    @torch.no_grad()
+    def count(self, plans: Plans | Tensor, retention: float = 1.0) -> None:
+        """Add earlier sequences of an individual to the counts with which each sequence begins, in place.
 
         Args:
-            plans: of the individual.
+            plans: of the individual; nothing fades within them.
+            retention: from 0 to 1: what was counted before counts so many times less.
 
         Raises:
             ValueError: plans of other actions than this prior's, or tables that would not fit into memory.
         """
         plans = counted_plans(self, plans) if isinstance(plans, Plans) else self.as_plans(plans)
         check_memory(4 * self.num_actions ** len(self.tables), concentrations=len(self.tables))
-        adapted = deepcopy(self)
         for level, name in enumerate(self.tables):
             windows = plans.actions.long().unfold(1, level + 1, 1)[plans.mask()[:, level:]]
             place = self.num_actions ** torch.arange(level, -1, -1, device=windows.device)
             counts = (windows * place).sum(-1).bincount(minlength=self.num_actions ** (level + 1))
             earlier, counts = getattr(self, name), counts.view(-1, self.num_actions).float()
-            adapted.register_buffer(name, earlier + counts if len(earlier) else counts)
-        return adapted
+            self.register_buffer(name, retention * earlier + counts if len(earlier) else counts)
 
 
 def join_columns(parts: Sequence[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:

@@ -24,7 +24,7 @@ from neuroprior import (
 )
 from neuroprior.agents import Agent, checkpoints, restore_agent, save_agent
 from neuroprior.planners import execute
-from neuroprior.priors import MixturePrior
+from neuroprior.priors import AdaptivePrior, MixturePrior
 from neuroprior.puzzles import AStarPlanner
 from neuroprior.worlds import EpisodicWorld
 from tests.support.sources import every_plan, refuses, seeded, stochastic_world
@@ -59,6 +59,27 @@ def test_without_learning_and_warm_starts_it_executes():
     assert done.model_steps == due.model_steps == 5 * 48
     assert torch.equal(one.state, done.states[:, -1])
     assert one.time == 10
+
+
+def test_an_adaptive_prior_counts_each_stored_plan_and_is_never_fitted(tmp_path):
+    """Earlier counts fade at each time at which another prior would be fitted."""
+    base = MarkovPrior(4, 1)
+    prior = AdaptivePrior(base, [float("inf"), 3.0, 1.0])
+    one = agent(prior, number=3, retention=0.75)
+    due, stored = torch.zeros(16, 4), []
+    for time in (6, 12, 18, 24):
+        stored.append(one.run(6).actions)
+        counts = torch.zeros(16, 4)
+        for plan in stored[-1].tolist():
+            for before, last, action in zip(plan, plan[1:], plan[2:], strict=False):
+                counts[4 * before + last, action] += 1
+        due = due * (1 if time % 12 else 0.75) + counts
+        assert prior.earlier_2.allclose(due)
+    assert not base.has_learned
+    save_agent(one, tmp_path)
+    new = agent(AdaptivePrior(MarkovPrior(4, 1), [float("inf"), 3.0, 1.0]), number=3, retention=0.75)
+    again = restore_agent(new, tmp_path)
+    assert again.prior.earlier_2.equal(prior.earlier_2)
 
 
 def test_warm_starts_are_counted():
