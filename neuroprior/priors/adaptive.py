@@ -164,7 +164,7 @@ class AdaptivePrior(Prior):
         """What was counted at each level before each of the steps from `first` on.
 
         Args:
-            actions: int64 `[N, L]`.
+            actions: int64 `[N, L]`; -1 where there is none, between sequences.
             first, steps: of the T steps.
 
         Returns:
@@ -173,14 +173,15 @@ class AdaptivePrior(Prior):
         now = torch.arange(first, first + steps, device=actions.device)
         past = torch.arange(min(first + steps - 1, actions.shape[1]), device=actions.device)
         alike = (past < now[:, None]).expand(len(actions), -1, -1)
-        one_hot = functional.one_hot(actions[:, : len(past)], self.num_actions).float()
+        before = actions[:, : len(past)]
+        one_hot = functional.one_hot(before.clamp(min=0), self.num_actions).float() * (before >= 0)[..., None]
         code, found = torch.zeros(len(actions), steps, dtype=torch.long, device=actions.device), []
         for level, name in enumerate(self.tables):
             if level > 0:
-                # The action so many steps before each; before the first stands -1, which is no action.
+                # The action so many steps before each; -1, before the first, is like no other.
                 padded = functional.pad(actions, (level, 0), value=-1)
                 then, last = padded[:, : len(past)], padded[:, now]
-                alike = alike & (last[..., None] == then[:, None])
+                alike = alike & (last[..., None] == then[:, None]) & (then >= 0)[:, None]
                 code = code + last.clamp(min=0) * self.num_actions ** (level - 1)
             weights = alike.float()
             if self.decay < 1:
@@ -269,6 +270,44 @@ class AdaptivePrior(Prior):
         adapted = deepcopy(self)
         adapted.count(plans)
         return adapted
+
+    @torch.no_grad()
+    def individual_log_probs(self, plans: Plans) -> Tensor:
+        """The log-probability of each action, given those before it and all earlier plans of its group.
+
+        The counts of a group go on from plan to plan, in their order; a history ends with its plan.
+
+        Args:
+            plans: with groups, the individuals; without, each plan is one.
+
+        Returns:
+            `[N, L]`, nats; 0 beyond a plan's end.
+
+        Raises:
+            ValueError: other actions or another context than this prior's.
+        """
+        plans = plans_for(self, self.as_plans(plans))
+        base = torch.cat([log_probs for _, log_probs in self.base.forecasts(plans)])
+        mask, pause = plans.mask(), len(self.tables)
+        group = torch.arange(len(plans), device=mask.device) if plans.group is None else plans.group
+        row = group.unique(return_inverse=True)[1]
+        sizes = mask.sum(1) + pause
+        order = row.argsort(stable=True)
+        begin = sizes[order].cumsum(0) - sizes[order]  # in all groups together, and then in its own
+        begin = begin - begin[torch.searchsorted(row[order], row[order])]
+        place = torch.empty_like(begin).index_copy_(0, order, begin)[:, None] + torch.arange(
+            plans.max_length, device=mask.device
+        )
+        at = row[:, None].expand(mask.shape)[mask], place[mask]
+        length = int(place[mask].max()) + 1 if mask.any() else 0
+        actions = torch.full((int(row.max()) + 1, length), -1, device=mask.device)
+        logits = base.new_zeros(*actions.shape, self.num_actions)
+        actions[at], logits[at] = plans.actions[mask].long(), base[mask]
+        for some, now in _blocks(*actions.shape):
+            logits[some, now] = self._adapt(logits[some, now], actions[some], now.start)
+        taken = base.new_zeros(mask.shape)
+        taken[mask] = logits[at].log_softmax(-1).gather(-1, plans.actions[mask].long()[:, None])[:, 0]
+        return taken
 
     @torch.no_grad()
     def count(self, plans: Plans | Tensor, retention: float = 1.0) -> None:

@@ -214,3 +214,25 @@ def test_wrong_arguments_are_refused(arguments, words):
         AdaptivePrior(UniformPrior(3), *arguments)
     with refuses("`plans` must have 3 actions", "got 4"):
         AdaptivePrior(UniformPrior(3)).adapted_to(Plans(torch.zeros(1, 2, dtype=torch.long), 4))
+
+
+@pytest.mark.parametrize("decay", [1.0, 0.7])
+def test_counts_of_an_individual_go_on_from_plan_to_plan(decay):
+    """As if each plan were scored by a prior adapted to those before it, where nothing fades; groups are mixed up."""
+    actions = torch.randint(3, (7, 9), generator=seeded(8))
+    plans = Plans(actions, 3, torch.tensor([9, 4, 0, 7, 1, 8, 5]), group=torch.tensor([2, 0, 2, 2, 5, 0, 2]))
+    prior = AdaptivePrior(MarkovPrior(3, 2).fit(SKEWED), [4.0, 2.0, 0.5], decay)
+    found = prior.individual_log_probs(plans)
+    assert found[~plans.mask()].abs().max() == 0
+    alone = plans.group == 5
+    assert found[alone].allclose(prior.action_log_probs(plans[alone]))
+    if decay < 1:
+        first = torch.tensor([0, 1])
+        assert found[first].allclose(prior.action_log_probs(plans[first]), atol=1e-6)
+        return
+    for number in range(7):
+        earlier = [
+            other for other in range(number) if plans.group[other] == plans.group[number] and plans.lengths[other]
+        ]
+        now = prior.adapted_to(plans[torch.tensor(earlier)]) if earlier else prior
+        assert found[number].allclose(now.action_log_probs(plans[number : number + 1])[0], atol=1e-5)
