@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from neuroprior.behaviour.durations.laws import LAW_NAMES, LawName
     from neuroprior.behaviour.durations.past_durations import PastDurations
     from neuroprior.behaviour.durations.semi_markov import SemiMarkovPrior
+    from neuroprior.behaviour.durations.survival import DurationSurvival, duration_survival
     from neuroprior.behaviour.reading import Columns, Options, ReadingError, read
     from neuroprior.behaviour.recorded_plans import RecordedPlans
     from neuroprior.behaviour.recordings import Recordings
@@ -69,6 +70,7 @@ __all__ = [
     "Difference",
     "DurationLaw",
     "DurationModel",
+    "DurationSurvival",
     "FitOptions",
     "GroupDrift",
     "HowFarBack",
@@ -100,6 +102,7 @@ __all__ = [
     "by_position",
     "choose_modes",
     "compare_conditions",
+    "duration_survival",
     "holm",
     "how_far_back",
     "individual_types",
@@ -143,6 +146,7 @@ _ROOMS = (
     "neuroprior.behaviour.durations.laws",
     "neuroprior.behaviour.durations.past_durations",
     "neuroprior.behaviour.durations.semi_markov",
+    "neuroprior.behaviour.durations.survival",
     "neuroprior.behaviour.recorded_plans",
     "neuroprior.behaviour.study",
     "neuroprior.behaviour.reporting",

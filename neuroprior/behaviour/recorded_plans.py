@@ -35,6 +35,8 @@ class RecordedPlans(Plans):
             where it is not known; None for plans without times. The unit is the user's, as of durations.
         durations: how long each action took, floating point `[N, L]`, stored as float32: at least 0, NaN where it is
             not known; None for plans without times. An end symbol takes no time.
+        cut_off: bool `[N, L]`: the action lasted to the end of what was watched, so that it took `durations` at least;
+            None: none did.
         condition: integers `[N]`: what plans are compared by, such as the treatment of the subject; None for none.
         condition_names: names of the conditions, numbered from 0, or None.
         stratum: integers `[N]`: within what conditions are compared, such as the sex of the subject; None for none.
@@ -51,11 +53,12 @@ class RecordedPlans(Plans):
     """
 
     PER_PLAN: ClassVar[tuple[str, ...]] = (*Plans.PER_PLAN, "recording", "condition", "stratum")
-    PER_ACTION: ClassVar[tuple[str, ...]] = (*Plans.PER_ACTION, "began", "durations")
+    PER_ACTION: ClassVar[tuple[str, ...]] = (*Plans.PER_ACTION, "began", "durations", "cut_off")
 
     recording: Sequence[str] | None = None
     began: Tensor | None = None
     durations: Tensor | None = None
+    cut_off: Tensor | None = None
     condition: Tensor | None = None
     condition_names: Sequence[str] | None = None
     stratum: Tensor | None = None
@@ -76,6 +79,11 @@ class RecordedPlans(Plans):
         if self.durations is not None:
             durations = self._times("durations", self.durations, torch.float32, 0)
             object.__setattr__(self, "durations", durations.masked_fill(~acted, 0))
+        if self.cut_off is not None:
+            if self.durations is None or self.cut_off.dtype != torch.bool:
+                raise ValueError("`cut_off` must be bool, of plans with durations")
+            check_shape("cut_off", self.cut_off, tuple(self.actions.shape))
+            object.__setattr__(self, "cut_off", self.cut_off & acted)
         for name in ("condition", "stratum"):
             if (numbers := getattr(self, name)) is not None:
                 object.__setattr__(self, name, as_integers(name, numbers, num))
@@ -180,6 +188,7 @@ def join_fragments(plans: Plans, *values: Tensor) -> tuple[Any, ...]:
 def plans_of_events(
     events: pd.DataFrame,
     fragment: NDArray[np.int64],
+    cut_off: NDArray[np.bool_],
     *,
     factors: Sequence[str],
     compare: str | None,
@@ -195,7 +204,7 @@ def plans_of_events(
     """Return the plans of the events of recordings; see `Recordings.plans`.
 
     Args:
-        events, fragment: of `Recordings`, of one observer.
+        events, fragment, cut_off: of `Recordings`, of one observer.
         factors: columns of what recordings can be compared by.
         compare, reference, strata: as of `Recordings.plans`.
         context: columns of what is observed before each action.
@@ -240,6 +249,7 @@ def plans_of_events(
         notes.append(f"{int(outside.sum()):,} events are of none of the behaviours; plans end there")
         cut[1:] |= outside[:-1]
         whole = np.cumsum(cut | outside)[~outside]
+        cut_off = cut_off[~outside]
         events, actions, cut = events[~outside], actions[~outside], np.diff(whole, prepend=-1) != 0
     if not len(actions):
         raise ValueError("`action_names` must hold a behaviour of the recordings, got none")
@@ -271,6 +281,7 @@ def plans_of_events(
         recording=tuple(first["recording"]),
         began=None if np.isnan(began).all() else pad(began),
         durations=None if np.isnan(durations).all() else pad(durations),
+        cut_off=pad(cut_off) if cut_off.any() else None,
         notes=tuple(notes),
         **fields,
     )

@@ -100,6 +100,20 @@ class Recordings:
         )
         return whole.reset_index(drop=True)
 
+    @property
+    def cut_off(self) -> NDArray[np.bool_]:
+        """Return which bouts, bool `[events]`, last to the end of what was watched: they may have gone on."""
+        start, stop = self.events["start"], self.events["stop"]
+        if self.spans is None:
+            end = stop.groupby(self.fragment).transform("max")
+        else:
+            known = start.notna()
+            spans = self.spans.rename(columns={"stop": "end"}).sort_values("start")
+            bouts = self.events.loc[known, [*KEYS, "start"]].reset_index(names="row").sort_values("start")
+            merged = pd.merge_asof(bouts, spans[[*KEYS, "start", "end"]], on="start", by=KEYS)
+            end = pd.Series(merged["end"].to_numpy(), index=merged["row"]).reindex(self.events.index)
+        return ((stop >= end) & (stop > start)).to_numpy(bool)
+
     def _replace_events(self, events: pd.DataFrame, fragment: NDArray[Any], *notes: str) -> "Recordings":
         """Return recordings of other events, with their fragments numbered anew and further notes."""
         numbers = np.unique(fragment, return_inverse=True)[1].astype(np.int64)
@@ -294,6 +308,7 @@ class Recordings:
         return plans_of_events(
             recordings.events,
             recordings.fragment,
+            recordings.cut_off,
             factors=self.factors,
             compare=compare,
             reference=reference,

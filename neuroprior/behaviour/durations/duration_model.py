@@ -17,6 +17,8 @@ from neuroprior.behaviour.durations.laws import (
     Sets,
     by_law,
     fit_laws,
+    log_likelihood,
+    log_survival,
     resolution,
 )
 from neuroprior.behaviour.recorded_plans import RecordedPlans, durations_of
@@ -67,7 +69,8 @@ class DurationModel(SavedModule):
     it: they then have a law for each next action that is frequent enough, all of one kind.
     Parts are held out by group (by plan, where there are no two groups; by time, where there is one plan).
 
-    Unknown durations are left out. An action with fewer than `FEWEST` known ones has the law of all actions together.
+    Of durations that were cut off only the probability counts that they are longer. Unknown ones are left out. An
+    action with fewer than `FEWEST` known ones has the law of all actions together.
     The laws are continuous: where durations were rounded, to frames or seconds, no law is narrower than the rounding.
 
     Args:
@@ -151,7 +154,7 @@ class DurationModel(SavedModule):
         zero = action[zeros].bincount(minlength=self.num_actions) / count.double()
         zero = torch.where(count < FEWEST, pooled, zero)
         action, after, time, fold = action[~zeros], after[~zeros], time[~zeros], fold[~zeros]
-        held = _Held(action, after, time, fold.unique(return_inverse=True)[1])
+        held = _Held(action, after, time, fold.unique(return_inverse=True)[1], _cut_off(plans)[known].cpu()[~zeros])
         chosen, fits, number = self._of_actions(held)
         law = torch.tensor([LAW_NAMES.index(name) for name in self.laws])
         own = fits[chosen, -1, torch.arange(self.num_actions)]
@@ -172,21 +175,21 @@ class DurationModel(SavedModule):
             each part and of all durations, and how many durations each action has.
         """
         size, laws = self.num_actions, len(self.laws)
-        number = held.action.bincount(minlength=size)
+        number = held.action[~held.cut_off].bincount(minlength=size)
         if not len(held.time):  # actions take no time at all, or none is known: the law is never used
             ones = torch.ones(laws, 1, size, MOST_PARAMETERS, dtype=torch.double)
             return torch.zeros(size, dtype=torch.long), ones, number
         # Last, all actions together, which stand for those with too few.
         cell = torch.cat([held.action, torch.full_like(held.action, size)])
-        time, part = held.time.repeat(2), held.part.repeat(2)
-        fits, count = _fits_without_parts(time, cell, size + 1, part, self.laws)
+        time, part, cut_off = held.time.repeat(2), held.part.repeat(2), held.cut_off.repeat(2)
+        fits, count = _fits_without_parts(time, cut_off, cell, size + 1, part, self.laws)
         few = count < FEWEST
         few[:, size] = False
         fits = torch.where(few[..., None], fits[:, :, size:], fits)
         score = torch.zeros(laws, size + 1, dtype=torch.double)
         if len(count) > 2:
             for place, name in enumerate(self.laws):
-                score[place].index_add_(0, cell, LAWS[name].log_density(time, fits[place, part, cell]))
+                score[place].index_add_(0, cell, log_likelihood(LAWS[name], time, cut_off, fits[place, part, cell]))
         chosen = (score - self._prices()[:, None]).argmax(0)
         return torch.where(number < FEWEST, chosen[size], chosen[:size]), fits[:, :, :size], number
 
@@ -196,22 +199,23 @@ class DurationModel(SavedModule):
         """The laws of transitions, of those actions that they predict better: pairs, places, parameters and numbers."""
         size, laws = self.num_actions, len(self.laws)
         code = held.action * size + held.after
-        pair, count = code[held.after >= 0].unique(return_counts=True)
+        pair, count = code[(held.after >= 0) & ~held.cut_off].unique(return_counts=True)
         pair = pair[count >= FEWEST_OF_TRANSITION]
         own = (held.after >= 0) & torch.isin(code, pair)
-        action, time, part = held.action[own], held.time[own], held.part[own]
+        action, time, part, cut_off = held.action[own], held.time[own], held.part[own], held.cut_off[own]
         cell, doing = torch.searchsorted(pair, code[own]), pair // size
         # The law of the action comes last.
         score = torch.zeros(laws + 1, size, dtype=torch.double)
         if not len(part) or bool((part == part[0]).all()):
             return pair[:0], pair[:0], score.new_zeros(0, MOST_PARAMETERS), pair[:0]
-        fits, count = _fits_without_parts(time, cell, len(pair), part, self.laws, of_actions.shape[1] - 1)
+        fits, count = _fits_without_parts(time, cut_off, cell, len(pair), part, self.laws, of_actions.shape[1] - 1)
         fits = torch.where((count < FEWEST)[..., None], of_actions[:, :, doing], fits)
         for place, name in enumerate(self.laws):
-            score[place].index_add_(0, action, LAWS[name].log_density(time, fits[place, part, cell]))
+            score[place].index_add_(0, action, log_likelihood(LAWS[name], time, cut_off, fits[place, part, cell]))
             same = law_of[action] == place
-            density = LAWS[name].log_density(time[same], of_actions[place, part[same], action[same]])
-            score[laws].index_add_(0, action[same], density)
+            parameters = of_actions[place, part[same], action[same]]
+            likely = log_likelihood(LAWS[name], time[same], cut_off[same], parameters)
+            score[laws].index_add_(0, action[same], likely)
         # The law of the action is needed in either case: for rare transitions, and at the end of a plan.
         score[:laws] -= self._prices()[:, None] * doing.bincount(minlength=size)
         best, chosen = score[:laws].max(0)
@@ -225,6 +229,8 @@ class DurationModel(SavedModule):
 
     def log_prob(self, plans: RecordedPlans) -> Tensor:
         """The log-density of each known duration, given its action and the next one; of a 0, its log-probability.
+
+        Of a duration that was cut off it is the log-probability that it is longer.
 
         Args:
             plans: with durations.
@@ -241,6 +247,9 @@ class DurationModel(SavedModule):
         time, row = durations_of(plans).double()[known], row[known]
         some = time > 0
         density = by_law("log_density", self.law[row[some]], time[some], self.values[row[some]])
+        longer = _cut_off(plans)[known][some]
+        above = by_law("cdf", self.law[row[some]][longer], time[some][longer], self.values[row[some]][longer])
+        density[longer] = log_survival(above)
         found = self.zero[row].log()
         found[some] = torch.log1p(-self.zero[row[some]]) + density
         return torch.zeros(known.shape, dtype=torch.double, device=known.device).masked_scatter(known, found)
@@ -304,7 +313,8 @@ class DurationModel(SavedModule):
         return functional.pad(after[:, 1:], (0, min(plans.max_length, 1)), value=-1)
 
     def _known(self, plans: RecordedPlans) -> Tensor:
-        return plans.mask(end=False) & ~durations_of(plans).isnan()
+        times = durations_of(plans)
+        return plans.mask(end=False) & ~times.isnan() & ~(_cut_off(plans) & (times == 0))
 
     def _check(self, plans: Plans, durations: bool = True) -> None:
         if plans.num_actions != self.num_actions:
@@ -327,16 +337,28 @@ class DurationModel(SavedModule):
 
 
 class _Held(NamedTuple):
-    """Durations above 0 `[n]`, and the part that each is held out with, from 0."""
+    """Durations above 0 `[n]`, the part that each is held out with, from 0, and whether it was cut off."""
 
     action: Tensor
     after: Tensor  # the next action; -1: there is none
     time: Tensor
     part: Tensor
+    cut_off: Tensor
+
+
+def _cut_off(plans: RecordedPlans) -> Tensor:
+    """Which durations `[N, L]` were cut off."""
+    return torch.zeros_like(plans.mask()) if plans.cut_off is None else plans.cut_off
 
 
 def _fits_without_parts(
-    time: Tensor, cell: Tensor, cells: int, part: Tensor, laws: Sequence[LawName], parts: int | None = None
+    time: Tensor,
+    cut_off: Tensor,
+    cell: Tensor,
+    cells: int,
+    part: Tensor,
+    laws: Sequence[LawName],
+    parts: int | None = None,
 ) -> tuple[Tensor, Tensor]:
     """K laws `[K, F + 1, C, ...]` fitted to each cell without each of F parts, and last to all; and of how many."""
     parts = int(part.max()) + 1 if parts is None else parts
@@ -344,8 +366,8 @@ def _fits_without_parts(
     for some in torch.arange(parts + 1).split(max(AT_ONCE // max(len(time), 1), 1)):
         without, index = (part != some[:, None]).nonzero(as_tuple=True)
         sets = Sets(time[index].log(), without * cells + cell[index], len(some) * cells, step)
-        count = sets.cell.bincount(minlength=sets.number).view(-1, cells)
-        found.append((fit_laws(sets, laws).unflatten(1, (len(some), cells)), count))
+        count = sets.cell[~cut_off[index]].bincount(minlength=sets.number).view(-1, cells)
+        found.append((fit_laws(sets, laws, cut_off[index]).unflatten(1, (len(some), cells)), count))
     fits, counts = zip(*found, strict=True)
     return torch.cat(fits, 1), torch.cat(counts)
 

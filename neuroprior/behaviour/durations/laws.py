@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from math import log, pi, sqrt
 from typing import Literal, NamedTuple, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -26,6 +27,9 @@ NEWTON_STEPS, EM_STEPS = 20, 50
 MOST_VALUES = 150
 """The most values of a set that a mixture is fitted to; of more durations, means of neighbours."""
 
+NODES, CUT_OFF_STEPS, CONVERGED_CUT_OFF = 16, 50, 1e-6
+"""Longer durations that one stands for that was cut off; most steps until their law stays, and how near it must be."""
+
 CONVERGED = 1e-10
 """Relative change of a parameter in a Newton step with which iteration ends."""
 
@@ -43,9 +47,12 @@ class Sets(NamedTuple):
     cell: Tensor  # [n] int64: the set of each
     number: int  # C
     resolution: float  # what durations are multiples of; 0: of nothing
+    weight: Tensor | None = None  # [n] float64: how often each counts; None: once
 
     def sums(self, values: Tensor) -> Tensor:
         """`[C, ...]`: the sum of `values [n, ...]` over each set."""
+        if self.weight is not None:
+            values = values * self.weight.view(-1, *[1] * (values.dim() - 1))
         return values.new_zeros(self.number, *values.shape[1:]).index_add_(0, self.cell, values)
 
     def mean(self, values: Tensor) -> Tensor:
@@ -171,9 +178,10 @@ def _condensed(values: Tensor, sets: Sets) -> tuple[Tensor, Tensor]:
     most = min(int(size.max()), MOST_VALUES) if len(size) else 0
     rank = torch.arange(len(cell), device=cell.device) - (size.cumsum(0) - size)[cell]
     place = cell * most + rank * size.clamp(max=MOST_VALUES)[cell] // size[cell]
-    number = place.bincount(minlength=sets.number * most).to(values)
-    sums = torch.zeros_like(number).index_add_(0, place, values[order])
-    return (sums / number.clamp(min=1)).view(sets.number, most), number.view(sets.number, most)
+    weight = torch.ones_like(values) if sets.weight is None else sets.weight[order]
+    number = values.new_zeros(sets.number * most).index_add_(0, place, weight)
+    sums = torch.zeros_like(number).index_add_(0, place, weight * values[order])
+    return (sums / number.clamp(min=1e-12)).view(sets.number, most), number.view(sets.number, most)
 
 
 def _normal(value: Tensor, mean: Tensor, spread: Tensor) -> Tensor:
@@ -258,10 +266,51 @@ LAWS: dict[LawName, Law] = {
 """By name, those with fewer parameters first."""
 
 
-def fit_laws(sets: Sets, laws: Sequence[LawName]) -> Tensor:
-    """`[K, C, MOST_PARAMETERS]`: the parameters of K laws in each set; those of an empty set are NaN."""
-    fits = [LAWS[law].fit(sets) for law in laws]
+def fit_laws(sets: Sets, laws: Sequence[LawName], cut_off: Tensor) -> Tensor:
+    """`[K, C, MOST_PARAMETERS]`: the parameters of K laws in each set; those of an empty set are NaN.
+
+    Args:
+        sets: of durations.
+        laws: names of K laws.
+        cut_off: bool `[n]`: the durations that are only known to be at least so long.
+    """
+    fits = [_fit_cut_off(LAWS[law], sets, cut_off) if bool(cut_off.any()) else LAWS[law].fit(sets) for law in laws]
     return torch.stack([functional.pad(own, (0, MOST_PARAMETERS - own.shape[-1])) for own in fits])
+
+
+def _fit_cut_off(law: Law, sets: Sets, cut_off: Tensor) -> Tensor:
+    """The maximum of the likelihood of durations, and of the survival of those that were cut off, `[C, K]`.
+
+    Expectation maximisation (Dempster, Laird and Rubin 1977): each of the latter stands for `NODES` longer ones of the
+    law so far, those of Gauss and Laguerre, by which the mean of an exponential law is exact.
+    """
+    nodes, weights = (torch.from_numpy(values) for values in np.polynomial.laguerre.laggauss(NODES))
+    least, cell = sets.log[cut_off].exp()[:, None], sets.cell[cut_off]
+    cells = torch.cat([sets.cell[~cut_off], cell.repeat_interleave(NODES)])
+    weight = torch.cat([torch.ones_like(sets.log[~cut_off]), weights.repeat(len(cell))])
+    fit = law.fit(sets)
+    for _ in range(CUT_OFF_STEPS):
+        of = fit[cell][:, None].expand(-1, NODES, -1)
+        number = 1 - (1 - law.cdf(least.expand(-1, NODES), of)) * (-nodes).exp()
+        times = law.quantile(number.clamp(max=1 - 2.0**-53), of).maximum(least)
+        values = torch.cat([sets.log[~cut_off], times.log().flatten()])
+        longer = Sets(values, cells, sets.number, sets.resolution, weight)
+        before, fit = fit, law.fit(longer)
+        if not bool(((fit - before).abs() > CONVERGED_CUT_OFF * fit.abs()).any()):
+            break
+    return fit
+
+
+def log_likelihood(law: Law, time: Tensor, cut_off: Tensor, parameters: Tensor) -> Tensor:
+    """The log-density of durations `[n]`; of those that were cut off the log-probability that they are longer."""
+    likely = law.log_density(time, parameters)
+    likely[cut_off] = log_survival(law.cdf(time[cut_off], parameters[cut_off]))
+    return likely
+
+
+def log_survival(cdf: Tensor) -> Tensor:
+    """The log-probability of more than durations of which `cdf` is the probability of at most these."""
+    return torch.log1p(-cdf.clamp(max=1 - 2.0**-53))
 
 
 def by_law(what: Literal["log_density", "cdf", "quantile"], law: Tensor, values: Tensor, parameters: Tensor) -> Tensor:

@@ -24,6 +24,7 @@ from neuroprior.behaviour.reporting.options import FitOptions, ReadOptions
 from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
 from neuroprior.behaviour.reporting.plan_report import report
 from neuroprior.behaviour.reporting.recordings import budget_figure, course_figure
+from neuroprior.behaviour.reporting.survival import survival_figure
 from neuroprior.behaviour.reporting.transitions import transition_graph_figure
 
 __all__ = [
@@ -49,6 +50,7 @@ __all__ = [
     "publish",
     "report",
     "score_figure",
+    "survival_figure",
     "table",
     "transition_figure",
     "transition_graph_figure",

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from neuroprior._statistics import ENOUGH_UNITS, ratio_difference
-from neuroprior.behaviour.analysis.comparison import Score, score_bits, unit_name
+from neuroprior.behaviour.analysis.comparison import Score, score_bits, too_few, unit_name
 from neuroprior.behaviour.durations.duration_model import DurationModel
 from neuroprior.behaviour.durations.laws import resolution
+from neuroprior.behaviour.durations.survival import duration_survival
 from neuroprior.behaviour.recorded_plans import RecordedPlans, action_names, durations_of
 from neuroprior.behaviour.reporting import figures
 from neuroprior.behaviour.reporting.document import Column, table
@@ -20,6 +21,7 @@ from neuroprior.behaviour.reporting.fits import ACTIONS, DURATIONS
 from neuroprior.behaviour.reporting.page import FigureBox, Section
 from neuroprior.behaviour.reporting.part import LISTED, Part, p_text
 from neuroprior.behaviour.reporting.scores import Evaluation
+from neuroprior.behaviour.reporting.survival import survival_figure, survival_findings, survival_table
 from neuroprior.plans import BLOCKS, FEWEST_UNITS, Plans, divisible, folds, in_parts
 from neuroprior.plans.folds import num_units
 from neuroprior.priors import MarkovPrior
@@ -100,7 +102,22 @@ def duration_section(found: Evaluation) -> Part | None:
     caption = "Density of the logarithm of durations above 0 (bars), and of the law that was fitted (line)."
     box = FigureBox(figure, caption, "Dwell times of the actions with their laws.", "dwell")
     frames = {"durations": frame, "duration_laws": laws, "next_by_duration": following, "dwell": dwell}
-    return Part(Section("Durations", text, tables, [box]), frames)
+    survival = duration_survival(found.plans, generator=torch.Generator().manual_seed(0))
+    too_few_units = too_few(found.plans)
+    frames |= {"survival": survival.frame(), "survival_tests": survival.medians()}
+    tables.append(survival_table(survival, too_few_units))
+    caption = (
+        "The share of bouts that last longer; bouts that were cut off count as long as they were seen. Bands: 95 %"
+    )
+    boxes = [
+        box,
+        FigureBox(
+            survival_figure(frames["survival"]), f"{caption} intervals over {over}.", "Survival of bouts.", "survival"
+        ),
+    ]
+    unit = found.recordings.unit if found.recordings is not None else ""
+    findings = survival_findings(survival, too_few_units, unit)
+    return Part(Section("Durations", text, tables, boxes), frames, findings=findings)
 
 
 def _parts(plans: RecordedPlans, known: Tensor) -> Iterator[tuple[RecordedPlans, Tensor]]:

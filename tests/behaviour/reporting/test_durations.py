@@ -60,7 +60,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Document, Path]:
 
 def test_the_section_of_a_file(made):
     document, folder = made
-    names = ["durations", "duration_laws", "next_by_duration", "dwell"]
+    names = ["durations", "duration_laws", "next_by_duration", "dwell", "survival", "survival_tests"]
     assert list(document.tables) == names
     assert all((folder / f"{name}.csv").exists() for name in names)
     frame = document.tables["durations"].set_index("action")

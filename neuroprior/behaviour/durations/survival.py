@@ -1,0 +1,195 @@
+"""How long bouts last where some were cut off: survival under each condition, and the log-rank test over subjects."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from scipy import special
+
+from neuroprior.behaviour.analysis.comparison import units
+from neuroprior.behaviour.analysis.permutation_design import PermutationDesign
+from neuroprior.behaviour.analysis.permutation_tests import combine_tests
+from neuroprior.behaviour.recorded_plans import RecordedPlans, action_names, durations_of, numbered_names
+
+Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+
+class Curve(NamedTuple):
+    """The survival of bouts at T times at which some ended, each float64 `[T]`.
+
+    Attributes:
+        time: ascending, in the unit of the durations.
+        survival: the share of bouts that last longer (Kaplan and Meier 1958).
+        low, high: its 95 % interval over units; NaN where there is none.
+        at_risk: how many bouts last at least so long.
+    """
+
+    time: Array
+    survival: Array
+    low: Array
+    high: Array
+    at_risk: Array
+
+    @property
+    def median(self) -> float:
+        """Return the first time that at most half of the bouts survive; infinite where more do."""
+        below = self.time[self.survival <= 0.5 + 1e-12]
+        return float(below[0]) if len(below) else np.inf
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class DurationSurvival:
+    """The survival of bouts of each behaviour under each condition.
+
+    Attributes:
+        curves: by behaviour and condition ("" without conditions).
+        tests: by behaviour the log-rank test's p-value, and that corrected for the number of behaviours; empty where
+            nothing can be tested.
+        design: what was permuted; None without conditions.
+    """
+
+    curves: Mapping[tuple[str, str], Curve]
+    tests: Mapping[str, tuple[float, float]]
+    design: PermutationDesign | None
+
+    def __repr__(self) -> str:
+        """Return the behaviour whose durations differ most clearly."""
+        said = "; no test"
+        if self.tests:
+            name, (_, corrected) = min(self.tests.items(), key=lambda item: item[1])
+            said = f"; {name}: p = {corrected:.2g}"
+        return f"DurationSurvival({len({key[0] for key in self.curves})} behaviours{said})"
+
+    def frame(self) -> pd.DataFrame:
+        """Return a row a time: `behaviour, condition, time, survival, low, high, at_risk`."""
+        parts = [
+            pd.DataFrame({"behaviour": behaviour, "condition": level} | curve._asdict())
+            for (behaviour, level), curve in self.curves.items()
+        ]
+        return pd.concat(parts, ignore_index=True)
+
+    def medians(self) -> pd.DataFrame:
+        """Return a row a behaviour: `behaviour`, the median under each condition, `p_value, corrected`."""
+        rows: dict[str, dict[str, object]] = {}
+        for (behaviour, level), curve in self.curves.items():
+            rows.setdefault(behaviour, {"behaviour": behaviour})[f"median, {level}".removesuffix(", ")] = curve.median
+        frame = pd.DataFrame(list(rows.values()))
+        for place, name in enumerate(("p_value", "corrected")):
+            frame[name] = [self.tests.get(behaviour, (np.nan, np.nan))[place] for behaviour in frame["behaviour"]]
+        return frame
+
+
+def duration_survival(
+    plans: RecordedPlans, permutations: int = 9999, generator: torch.Generator | None = None
+) -> DurationSurvival:
+    """Return how long bouts of each behaviour last, and whether that differs between conditions.
+
+    A bout that was cut off counts as going on for as long as it was seen. Intervals leave out one unit at a time
+    (jackknife), on the scale log(-log S). The test is the log-rank test (Mantel 1966): observed less expected ends,
+    where what is expected is the hazard of the stratum, or in paired designs of the subject. Its null distribution is
+    that of permuted conditions of whole units (see `PermutationDesign`), so that bouts of a subject may be alike.
+
+    Args:
+        plans: with durations; a condition is compared within strata, where there are any.
+        permutations: random ones at most; all where there are no more.
+        generator: draws them.
+
+    Raises:
+        ValueError: plans without durations above 0.
+
+    Example:
+        >>> durations = torch.tensor([[1.0, 4.0, 1.2, 3.5]]).repeat(6, 1)
+        >>> plans = RecordedPlans(torch.tensor([[0, 1, 0, 1]]).repeat(6, 1), 2, durations=durations)
+        >>> duration_survival(plans).curves["0", ""].median
+        1.0
+    """
+    times = durations_of(plans)
+    known = plans.mask(end=False) & (times > 0)
+    if not bool(known.any()):
+        raise ValueError("`plans` must have durations above 0, got none")
+    time = times[known].double().cpu().numpy()
+    ended = np.ones(len(time), bool) if plans.cut_off is None else ~plans.cut_off[known].cpu().numpy()
+    action = plans.actions[known].long().cpu().numpy()
+    unit, plan = units(plans, known)[known].cpu().numpy(), known.nonzero()[:, 0].cpu().numpy()
+    levels, level = [""], np.zeros(len(time), np.int64)
+    if plans.condition is not None:
+        level = plans.condition.cpu().numpy()[plan]
+        levels = numbered_names(plans.condition_names, torch.arange(int(plans.condition.max()) + 1), "condition")
+    names, curves = action_names(plans), dict[tuple[str, str], Curve]()
+    for number in np.flatnonzero(np.bincount(action[ended], minlength=len(names))):
+        for place in np.unique(level[(action == number) & ended]):
+            own = (action == number) & (level == place)
+            curves[names[number], levels[place]] = survival_curve(time[own], ended[own], unit[own])
+    if plans.condition is None:
+        return DurationSurvival(curves, {}, None)
+    design = PermutationDesign.of(plans)
+    if design.untestable:
+        return DurationSurvival(curves, {}, design)
+    labels = design.labellings(permutations, generator)
+    block = design.block.numpy()[plan]
+    statistics = {}
+    for number in np.flatnonzero(np.bincount(action[ended & (block >= 0)], minlength=len(names))):
+        own = (action == number) & (block >= 0)
+        ends, expected = _count_ends(time[own], ended[own], block[own], design.cell.numpy())
+        statistics[names[number]] = _log_rank(ends, expected, labels, len(design.conditions))
+    return DurationSurvival(curves, combine_tests(statistics)[0], design)
+
+
+def survival_curve(time: Array, ended: NDArray[np.bool_], unit: Numbers) -> Curve:
+    """Return the survival of bouts with its interval over units.
+
+    Args:
+        time: `[n]`: how long each lasted, or was seen.
+        ended: bool `[n]`: whether it ended then.
+        unit: int `[n]`.
+    """
+    at = np.unique(time[ended])
+    of_unit, numbers = pd.factorize(unit)
+    ends, at_risk = np.zeros((2, len(numbers), len(at)))
+    place = np.searchsorted(at, time, "right") - 1
+    np.add.at(ends, (of_unit[ended], place[ended]), 1)
+    seen = place >= 0
+    np.add.at(at_risk, (of_unit[seen], place[seen]), 1)
+    at_risk = at_risk[:, ::-1].cumsum(1)[:, ::-1]
+    whole = _survive(ends.sum(0), at_risk.sum(0))
+    low = high = np.full(len(at), np.nan)
+    if len(numbers) > 1:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            without = np.log(-np.log(_survive(ends.sum(0) - ends, at_risk.sum(0) - at_risk)))
+            error = np.sqrt((len(numbers) - 1) * without.var(0))
+            bounds = [whole ** np.exp(sign * special.stdtrit(len(numbers) - 1, 0.975) * error) for sign in (1, -1)]
+        inside = np.isfinite(error)
+        low, high = (np.where(inside, bound, np.nan) for bound in bounds)
+    return Curve(at, whole, low, high, at_risk.sum(0))
+
+
+def _survive(ends: Array, at_risk: Array) -> Array:
+    survival: Array = (1 - ends / np.maximum(at_risk, 1)).cumprod(-1)
+    return survival
+
+
+def _count_ends(time: Array, ended: NDArray[np.bool_], block: Numbers, cell: Numbers) -> tuple[Array, Array]:
+    """Return how many bouts of each block `[B]` ended, and how many were expected to by the hazard of its cell."""
+    expected = np.zeros(len(time))
+    for number in np.unique(cell[block]):
+        own = cell[block] == number
+        place = np.unique(time[own], return_inverse=True)[1]
+        at_risk = np.bincount(place)[::-1].cumsum()[::-1]
+        expected[own] = (np.bincount(place, ended[own]) / at_risk).cumsum()[place]
+    ends, due = (np.asarray(np.bincount(block, one, len(cell)), np.float64) for one in (ended, expected))
+    return ends, due
+
+
+def _log_rank(ends: Array, expected: Array, labels: torch.Tensor, conditions: int) -> torch.Tensor:
+    """Return the statistic of each labelling `[P]`: squares of observed less expected ends, by expected ones."""
+    excess, due = torch.from_numpy(ends - expected), torch.from_numpy(expected)
+    total = torch.zeros(labels.shape[1], dtype=torch.double)
+    for condition in range(conditions):
+        under = (labels == condition).double()
+        total += (excess @ under).square() / (due @ under).clamp(min=1e-9)
+    return total
