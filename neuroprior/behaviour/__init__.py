@@ -41,6 +41,7 @@ if TYPE_CHECKING:
         by_plan,
         by_position,
     )
+    from neuroprior.behaviour.analysis.individuality import Individuality, individuality
     from neuroprior.behaviour.analysis.individuals import Individuals, Types, individual_types, individuals
     from neuroprior.behaviour.analysis.interaction import ConditionInteraction, InteractionFamily
     from neuroprior.behaviour.analysis.lags import HowFarBack, how_far_back
@@ -74,6 +75,7 @@ __all__ = [
     "FitOptions",
     "GroupDrift",
     "HowFarBack",
+    "Individuality",
     "Individuals",
     "InteractionFamily",
     "Interval",
@@ -106,6 +108,7 @@ __all__ = [
     "holm",
     "how_far_back",
     "individual_types",
+    "individuality",
     "individuals",
     "large_study",
     "mean_interval",
@@ -136,6 +139,7 @@ _ROOMS = (
     "neuroprior.behaviour.analysis.drift",
     "neuroprior.behaviour.analysis.individuals",
     "neuroprior.behaviour.analysis.interaction",
+    "neuroprior.behaviour.analysis.individuality",
     "neuroprior.behaviour.analysis.lags",
     "neuroprior.behaviour.analysis.modes",
     "neuroprior.behaviour.analysis.motifs",

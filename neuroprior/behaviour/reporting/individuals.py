@@ -1,6 +1,7 @@
 """The section on individuals: how each differs from the others, where it stands, and whether there are types."""
 
 from collections.abc import Sequence
+from math import inf
 
 import numpy as np
 import pandas as pd
@@ -12,6 +13,7 @@ from scipy.spatial.distance import squareform
 
 from neuroprior._statistics import ENOUGH_UNITS, LEVEL
 from neuroprior.behaviour.analysis.comparison import too_few
+from neuroprior.behaviour.analysis.individuality import Individuality, individuality
 from neuroprior.behaviour.analysis.individuals import (
     FEWEST_INDIVIDUALS,
     Individuals,
@@ -36,8 +38,8 @@ from neuroprior.behaviour.reporting.drawing import (
 )
 from neuroprior.behaviour.reporting.figures import OTHER
 from neuroprior.behaviour.reporting.findings import Finding, p_words
-from neuroprior.behaviour.reporting.page import INK, FigureBox, Section
-from neuroprior.behaviour.reporting.part import Part, without_verdict
+from neuroprior.behaviour.reporting.page import INK, FigureBox, Section, Table
+from neuroprior.behaviour.reporting.part import LISTED, Part, without_verdict
 from neuroprior.behaviour.reporting.scores import Evaluation
 
 
@@ -107,7 +109,42 @@ def individual_section(found: Evaluation) -> Part | None:
         findings = []
     elif not starred:
         text.append(without_verdict(too_few(plans)) or f"That they differ was not found ({p_words(p_value)}).")
+    if len(result.names) >= FEWEST_INDIVIDUALS:
+        own = individuality(plans)
+        frames |= {"individuality": own.frame(), "individuality_by_behaviour": own.behaviours()}
+        finding = _individuality_finding(own, enough)
+        findings.append(finding)
+        text.append(finding.sentence)
+        tables.append(_individuality_table(own))
     return Part(Section("Individuals", text, tables, boxes), frames, findings=findings)
+
+
+def _individuality_finding(own: Individuality, enough: bool) -> Finding:
+    saved, low, high, p_value = own.total
+    concentration = own.concentrations[-1]
+    after = f" (its own transitions count as much as those of all after {concentration:.0f} of them)"
+    sentence = (
+        f"Predictions that follow the individual save {saved:.4f} bits per behaviour, 95 % interval {low:.4f} to"
+        f" {high:.4f}: {100 * own.share:.2g} % of all that is predicted{after * (concentration < inf)};"
+        f" {p_words(p_value)}."
+    )
+    name, starred = "individuality", enough and p_value < LEVEL and saved > 0
+    return Finding(name, name, name, saved, low, high, p_value, p_value, bool(starred), sentence)
+
+
+def _individuality_table(own: Individuality) -> Table:
+    rows = own.behaviours().sort_values("saved", ascending=False, kind="stable")
+    columns: dict[str, Column] = {
+        "behaviour": "behaviour",
+        "bouts": "bouts:,",
+        "bits": "bits:.3f",
+        "saved": "saved:+.4f",
+    }
+    caption = (
+        "Bits per bout of each behaviour under a chain of order 1 of the other subjects, and how many are saved where"
+        " its predictions are drawn to what the subject did before. What a condition changes counts, too."
+    )
+    return table(rows.head(LISTED), columns, caption, "Individuality", "lrrr")
 
 
 def individual_budget(plans: RecordedPlans) -> pd.DataFrame:
