@@ -147,6 +147,13 @@ def _notes_on_labels(table: Table, labels: NDArray[Any], part: Part, only_starts
         what = f"rows have no label (first in {table.place(int(missing.argmax()))})"
         notes.append(f"{missing.sum():,} of {len(labels):,} {what}: another fragment begins after each")
     part.note_repeats("behaviours", " if a row is a frame,")
+    endless = part.events["stop"].isna().to_numpy() & part.events["start"].notna().to_numpy()
+    if 0 < endless.sum() < len(endless) and table.options.ends != "next":
+        where = table.place(int(part.rows[endless.argmax()]))
+        part.first_notes.append(
+            f"{endless.sum():,} of {len(endless):,} events have no stop (first in {where}): their durations are unknown"
+            " (--ends next: until the next begins)"
+        )
     if only_starts:
         notes.append("no stops are known, and no durations (--ends next: each behaviour lasts until the next begins)")
     return notes

@@ -27,8 +27,8 @@ class Options:
             which nothing was done.
         missing_words: labels that stand for none, beside the empty cell.
         unpaired: starts without a stop, and stops without a start: an "error", "drop" both, or keep "open" starts.
-        overlaps: overlapping bouts of one behaviour of one subject: an "error", or "keep"; "join" reads behaviours
-            done at once, in columns of zeros and ones, as one ("groom+rear").
+        overlaps: overlapping bouts of one behaviour of one subject: an "error", or "keep"; "join", for columns of zeros
+            and ones alone, reads behaviours done at once as one ("groom+rear").
         ends: whether a stop is the last unit of a bout ("inclusive") or the first after it ("exclusive"); "auto": as
             the file shows; "next": a stop that is not known is the next start.
         day_first: whether 1/2/2024 is the first of February; None: as the file shows.

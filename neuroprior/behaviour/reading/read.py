@@ -149,11 +149,28 @@ def _read_sheet(sheet: Sheet, options: Options) -> Part:
         events = events.assign(start=np.array([], float), stop=np.array([], float))
         nothing, note = np.array([], np.int64), f"{sheet.name} has no rows"
         return Part(sheet, roles, events, nothing, nothing, first_notes=[note], empty=[sheet.stem])
+    if options.overlaps == "join" and roles.layout != "columns of behaviours":
+        problems.add(f"`overlaps` must be error or keep in {roles.layout}, got 'join'", [0], table.place)
     part = LAYOUTS[roles.layout](table)
     _check_observers(table, part, problems)
     _check_factors(part, problems)
     problems.stop()
+    if roles.layout != "columns of behaviours":  # which has said so of its rows
+        _note_overlaps(table, part)
     return part
+
+
+def _note_overlaps(table: Table, part: Part) -> None:
+    """Note that bouts begin before those of other behaviours have ended."""
+    events = part.events
+    timed = np.flatnonzero((events["stop"] > events["start"]) & (events["behaviour"] != ""))
+    keys = [key for key in (*KEYS, "observer") if key in events]
+    unit = np.asarray(events.iloc[timed].groupby(keys, sort=False).ngroup(), np.int64)
+    late = timed[overlapping(unit, *(events[end].to_numpy(float)[timed] for end in ("start", "stop")))]
+    if late.size:
+        where = table.place(int(part.rows[late.min()]))
+        what = f"{late.size:,} of {timed.size:,} bouts begin before another one has ended (first in {where})"
+        part.first_notes.append(f"{what}: shares of time add up to more than 100 %")
 
 
 def _check_observers(table: Table, part: Part, problems: Problems) -> None:
@@ -220,12 +237,14 @@ def _check_factors(part: Part, problems: Problems) -> None:
         varying = np.flatnonzero((part.events[name] != first).to_numpy())
         if not varying.size:
             continue
+        values = f"{part.events[name].iloc[varying[0]]!r} beside {first.iloc[varying[0]]!r}"
         if "factors" in part.roles.inferred:
             part.events = part.events.drop(columns=name)
             part.roles.at["factors"].remove(name)
-            part.notes.append(f"the column {name!r} varies within recordings, and is not used as a factor")
+            where = part.sheet.place(int(part.rows[varying[0]]))
+            what = f"the column {name!r} varies within recordings, and is not used as a factor"
+            part.first_notes.append(f"{what} (first in {where}: {values})")
         else:
-            values = f"{part.events[name].iloc[varying[0]]!r} beside {first.iloc[varying[0]]!r}"
             what = f"the factor {name!r} must not vary within a recording, got {values}"
             problems.add(what, part.rows[varying].tolist(), part.sheet.place)
 
