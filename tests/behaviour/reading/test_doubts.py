@@ -1,5 +1,7 @@
 """Notes on what a reader of shares of time and of conditions should know, each with its first line."""
 
+from contextlib import chdir
+
 import pytest
 
 from neuroprior.behaviour import read
@@ -14,9 +16,9 @@ SOUND = (
 
 def notes_on(tmp_path, changes, **options):
     lines = [changes.get(number, line) for number, line in enumerate(SOUND, 2)]
-    file = tmp_path / "study.csv"
-    file.write_text(HEADER + "\n".join(lines) + "\n")
-    return read(file, **options).notes
+    (tmp_path / "study.csv").write_text(HEADER + "\n".join(lines) + "\n")
+    with chdir(tmp_path):
+        return read("study.csv", **options).notes
 
 
 def test_a_sound_file_needs_no_notes(tmp_path):
