@@ -31,9 +31,10 @@ from neuroprior.plans import write_plans
 from neuroprior.plans.io.npz import read_npz
 from neuroprior.priors import CombinedPrior, MarkovPrior, Prior, SwitchingPrior, load
 from neuroprior.priors.ensembles.candidates import Effort
-from neuroprior.priors.fitting import make_prior
+from neuroprior.priors.fitting import PRIORS, make_prior
 from neuroprior.priors.learning import plans_for
 from neuroprior.priors.neural import NeuralPrior
+from neuroprior.priors.saved import SavedModule
 from neuroprior.training import Settings, train
 from neuroprior.worlds import World
 
@@ -79,7 +80,7 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("plans", nargs="*", type=str, default=[], help="Files of behaviour or plans, or minari:NAME.")
     parser.add_argument("--config", action=Recipe, help=f"A recipe: a file, or one of {', '.join(recipes())}.")
     parser.add_class_arguments(Settings, as_group=False, skip={"validation"})
-    given = parser.parse_args(arguments)
+    given = parser.parse_args(_with_classes(arguments))
     if (folder := given.resume) is not None:
         if given != parser.parse_args(["--resume", folder]):
             raise ValueError("`resume` must be given alone: a run goes on with its own options.")
@@ -91,6 +92,19 @@ def run(arguments: list[str]) -> None:
     training = Settings(**{name: made.pop(name) for name in TRAINING})
     reading = pop_reading(made, ReadOptions)
     fit(**made, training=training, options=options, reading=reading)
+
+
+def _with_classes(arguments: list[str]) -> list[str]:
+    """Return the arguments with names of priors, such as gru, as the classes or functions that make them."""
+    places = [number for number, before in enumerate(arguments, 1) if before == "--prior" and number < len(arguments)]
+    made = list(arguments)
+    for place in places:
+        name = arguments[place]
+        if name.isidentifier() and PRIORS.find(name) is None and SavedModule.known.find(name) is None:
+            raise ValueError(f"`prior` must be one of {', '.join(PRIORS)}, or a class, got {name}.")
+        if (kind := PRIORS.find(name)) is not None:
+            made[place] = f"{kind.__module__}.{getattr(kind, '__name__', '')}"
+    return made
 
 
 def fit(
@@ -121,8 +135,9 @@ def fit(
     Args:
         plans: files of behaviour (see `neuroprior.behaviour.read`), or of plans: `.npz`, `.jsonl`, or `minari:` and
             the name of a Minari dataset.
-        prior: its class, such as GRUPrior; its own arguments go below it (`--prior.hidden_size 128`). The number of
-            actions and of contexts come from the plans.
+        prior: its name, such as gru, or class, such as GRUPrior; its own arguments go below it
+            (`--prior.hidden_size 128`). The number of actions, and the context if the prior can take one, come from the
+            plans.
         effort: how much the combined prior spends on networks.
         modes: numbers of hidden modes of a SwitchingPrior to choose from: the fewest that predict held-out plans as
             well as the best.

@@ -60,8 +60,9 @@ def fair_split(
 ) -> tuple[AnySequences, AnySequences]:
     """Plans to learn from, and plans that are held out at random: about a share of all actions.
 
-    Where groups, or plans without groups, are so unequal that those drawn are no such share, others are drawn. Where
-    that does not help, of groups those are held out that came nearest; of plans the end of the longest.
+    A single group is none. Where groups, or plans without groups, are so unequal that those drawn are no such share,
+    others are drawn. Where that does not help, of groups those are held out that came nearest; of plans the end of the
+    longest.
 
     Args:
         plans: of actions or of vectors.
@@ -72,6 +73,7 @@ def fair_split(
     Raises:
         ValueError: `share` is not between 0 and 1, or the plans cannot be split, see `Plans.split`.
     """
+    plans = divisible(plans)
     lengths, nearest = plans.mask().sum(1), None
     total, longest = int(lengths.sum()), int(lengths.max()) if len(lengths) else 0
     for _ in range(DRAWS):

@@ -37,8 +37,8 @@ def test_a_sound_file_needs_no_notes(tmp_path):
         (
             {5: "m2,walk,0,3.5,drug", 7: "m2,walk,6,8.25,drug"},
             {},
-            "2 of 7 bouts begin before another one has ended (first in study.csv, line 6): shares of time add up to more"
-            " than 100 %",
+            "2 of 7 bouts begin before another one has ended (first in study.csv, line 6): shares of time add up to"
+            " more than 100 %",
         ),
         (
             {7: "m2,walk,6,7,saline"},
