@@ -1,5 +1,6 @@
 """Survival of bouts against scipy and plain loops, the log-rank test by enumeration, laws of censored durations."""
 
+from dataclasses import replace
 from math import log
 
 import numpy as np
@@ -68,6 +69,52 @@ def test_survival_is_that_of_scipy_and_its_interval_leaves_out_a_subject():
     frame = result.frame()
     assert len(frame) == sum(len(curve.time) for curve in result.curves.values())
     assert list(frame.columns) == ["behaviour", "condition", "time", "survival", "low", "high", "at_risk"]
+
+
+def area(time, ended, weight, limit):
+    """The area below the weighted survival of bouts, in plain loops."""
+    total, share, last = 0.0, 1.0, 0.0
+    for at in sorted({*time[ended]}):
+        if at < limit:
+            total, last = total + share * (at - last), at
+            share *= 1 - weight[ended & (time == at)].sum() / weight[time >= at].sum()
+    return total + share * (limit - last)
+
+
+@pytest.mark.parametrize("kind", ["between", "strata", "within"])
+def test_ratios_of_restricted_means_leave_out_a_subject(kind):
+    """In strata of unequal sizes, and in pairs, in plain loops: each subject counts once more where others are few."""
+    plans = censored(2, 9, 2.0, kind == "strata")
+    if kind == "within":
+        pair = torch.arange(9) // 2
+        plans = replace(plans, group=pair, condition=(torch.arange(9) % 2 == pair % 2).long())
+    result = duration_survival(plans, 99, seeded(0))
+    time, ended, action, unit, condition = known(plans)
+    rest = action == 0
+    subjects = 4 if kind == "within" else 9
+    cell = [number % 2 if kind == "strata" else 0 for number in range(subjects)]
+    treated = [int(condition[unit == number][0]) for number in range(subjects)]
+    inside = rest & (unit < subjects)
+    limit = min(time[inside & (condition == c)].max() for c in (0, 1))
+
+    def change(out):
+        logs = []
+        for c in (0, 1):
+            weight = np.zeros(len(time))
+            for number in set(range(subjects)) - {out}:
+                alike = [k for k in range(subjects) if cell[k] == cell[number]]
+                there = [k for k in alike if treated[k] == c and k != out]
+                weight[unit == number] = 1 if kind == "within" else len(alike) / max(len(there), 1)
+            own = inside & (condition == c) & (weight > 0)
+            logs.append(log(area(time[own], ended[own], weight[own], limit)))
+        return logs[1] - logs[0]
+
+    group = [0 if kind == "within" else (cell[k], treated[k]) for k in range(subjects)]
+    shares = [(group.count(one) - 1) / group.count(one) for one in group]
+    error = sum(share * (change(k) - change(None)) ** 2 for k, share in enumerate(shares)) ** 0.5
+    half = stats.t.ppf(0.975, subjects - len({*group})) * error
+    want = np.exp([change(None), change(None) - half, change(None) + half])
+    assert list(result.ratios["rest"]) == pytest.approx(want.tolist())
 
 
 def test_a_curve_by_hand():
@@ -202,7 +249,7 @@ def test_the_report_stars_survival_as_findings(subjects, starred):
     part = duration_section(evaluate_saved({"uniform": UniformPrior(2)}, plans, 0))
     result = duration_survival(plans, generator=seeded(0))
     assert [one.feature for one in part.findings if one.starred] == starred
-    assert {one.id: one.p_corrected for one in part.findings} == {
+    assert {one.id: one.p_corrected for one in part.findings if one.family == "survival"} == {
         f"survival: {name}": corrected for name, (_, corrected) in result.tests.items()
     }
     table = next(one for one in part.section.tables if one.title == "Survival of bouts")
@@ -213,5 +260,19 @@ def test_the_report_stars_survival_as_findings(subjects, starred):
     (box,) = (one for one in part.section.figures if one.name == "survival")
     lines = [line.get_ydata().tolist() for axes in box.figure.axes for line in axes.lines]
     assert result.curves["rest", "drug"].survival.tolist() in lines
-    if starred:
-        assert part.findings[0].sentence.startswith("How long a bout of rest lasts differs between conditions: medians")
+    finding = next(one for one in part.findings if one.id == "survival: rest")
+    assert (finding.effect, finding.low, finding.high) == result.ratios["rest"]
+    sentence = f"Bouts of rest last {finding.effect:.3g} times as long under drug as under saline, 95 % interval "
+    assert finding.sentence.startswith(f"{sentence}{finding.low:.3g} to {finding.high:.3g}; log-rank test, p ")
+    assert result.medians().loc[0, ["ratio", "low", "high"]].tolist() == list(result.ratios["rest"])
+
+
+def test_of_three_conditions_there_are_medians():
+    plans = censored(0, 18, 4.0)
+    third = torch.arange(18) % 3 == 0
+    three = replace(plans, condition=torch.where(third, 2, plans.condition), condition_names=("saline", "drug", "old"))
+    assert duration_survival(three, 99, seeded(0)).ratios == {}
+    part = duration_section(evaluate_saved({"uniform": UniformPrior(2)}, three, 0))
+    finding = next(one for one in part.findings if one.id == "survival: rest")
+    assert finding.effect is None
+    assert finding.sentence.startswith("How long a bout of rest lasts differs between conditions: medians")

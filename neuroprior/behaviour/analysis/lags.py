@@ -117,11 +117,9 @@ def how_far_back(plans: Plans, max_lag: int = 4, skip: int = 0) -> HowFarBack:
     later[:, : max(1, skip)] = False
     if len(units(plans, later)[later].unique()) < 2 or unit_name(plans, later) == "parts of the plan":
         raise ValueError(f"`plans` must have two units with successive actions after the first {skip}, got fewer")
-    actions = plans.actions.cpu().long().numpy()[mask.numpy()]
-    step = mask.nonzero()[:, 1].numpy()
-    unit = np.unique(units(plans, mask)[mask].cpu().numpy(), return_inverse=True)[1]
+    actions, step, unit = actions_in_a_row(plans)
     fold = unit % MAX_FOLDS
-    history, bits = np.zeros(len(actions), np.int64), _bits_of_shares(actions, fold, plans.num_actions)
+    history, bits = np.zeros(len(actions), np.int64), bits_of_shares(actions, fold, plans.num_actions)
     gains, above = list[Difference](), list[float]()
     for lag in range(1, max_lag + 1):
         known = step >= lag
@@ -130,7 +128,7 @@ def how_far_back(plans: Plans, max_lag: int = 4, skip: int = 0) -> HowFarBack:
             break
         past = np.where(known, np.roll(actions, lag) + 1, 0)
         history = np.unique(history * (plans.num_actions + 1) + past, return_inverse=True)[1]
-        better = _bits_after(history, actions, fold, bits, known)
+        better = bits_after(history, actions, fold, bits, known)
         gain, size = np.zeros(unit.max() + 1), np.bincount(unit[inside], minlength=unit.max() + 1)
         np.add.at(gain, unit[inside], (bits - better)[inside])
         gain, size = np.round(gain, 9)[size > 0], size[size > 0]
@@ -143,7 +141,14 @@ def how_far_back(plans: Plans, max_lag: int = 4, skip: int = 0) -> HowFarBack:
     return HowFarBack(gains, corrected, reach, unit_name(plans, later), int(unit.max()) + 1, few)
 
 
-def _bits_of_shares(actions: Array, fold: Array, size: int) -> Array:
+def actions_in_a_row(plans: Plans) -> tuple[Array, Array, Array]:
+    """Return all actions `[M]`, plan after plan, the step of each from 0, and its unit from 0, int64."""
+    mask = plans.mask().cpu()
+    unit = np.unique(units(plans, mask)[mask].cpu().numpy(), return_inverse=True)[1]
+    return plans.actions.cpu().long().numpy()[mask.numpy()], mask.nonzero()[:, 1].numpy(), unit
+
+
+def bits_of_shares(actions: Array, fold: Array, size: int) -> Array:
     """Return the bits of each action `[M]` by the shares of all in the other folds, with one pseudo-count each."""
     counts = np.zeros((fold.max() + 1, size))
     np.add.at(counts, (fold, actions), 1)
@@ -151,7 +156,7 @@ def _bits_of_shares(actions: Array, fold: Array, size: int) -> Array:
     return np.asarray(-np.log2(others[fold, actions] / others.sum(1)[fold]))
 
 
-def _bits_after(history: Array, actions: Array, fold: Array, lower: Array, known: Array) -> Array:
+def bits_after(history: Array, actions: Array, fold: Array, lower: Array, known: Array) -> Array:
     """Return the bits of each action `[M]` after its history, learned in the other folds.
 
     Args:
@@ -160,17 +165,22 @@ def _bits_after(history: Array, actions: Array, fold: Array, lower: Array, known
         lower: `[M]`: the bits after the history without its oldest action; those of unknown histories remain.
         known: bool `[M]`: whether the history is there.
     """
-    bits, prob = lower.copy(), np.exp2(-lower)
-    pair = np.unique(history * (actions.max() + 1) + actions, return_inverse=True)[1]
+    bits = lower.copy()
     for number in np.unique(fold):
-        training, held_out = known & (fold != number), known & (fold == number)
-        of_pair, of_history = (np.bincount(code[training], minlength=code.max() + 1) for code in (pair, history))
-        pairs, first = np.unique(pair[training], return_index=True)
-        # The probability of each pair is that without its own fold for all of them: nearly the same in each.
-        weight = max(PSEUDO_COUNTS, key=lambda one: _evidence(of_pair[pairs], prob[training][first], of_history, one))
-        likely = (of_pair[pair] + weight * prob) / (of_history[history] + weight)
-        bits[held_out] = -np.log2(likely[held_out])
+        held_out = known & (fold == number)
+        bits[held_out] = bits_held_out(history, actions, known & (fold != number), held_out, lower)
     return bits
+
+
+def bits_held_out(history: Array, actions: Array, training: Array, held_out: Array, lower: Array) -> Array:
+    """Return the bits of the actions that are `held_out`, bool `[M]`, learned from those in `training`."""
+    prob, pair = np.exp2(-lower), np.unique(history * (actions.max() + 1) + actions, return_inverse=True)[1]
+    of_pair, of_history = (np.bincount(code[training], minlength=code.max() + 1) for code in (pair, history))
+    pairs, first = np.unique(pair[training], return_index=True)
+    # The probability of each pair is that without its own fold for all of them: nearly the same in each.
+    weight = max(PSEUDO_COUNTS, key=lambda one: _evidence(of_pair[pairs], prob[training][first], of_history, one))
+    likely = (of_pair[pair] + weight * prob) / (of_history[history] + weight)
+    return np.asarray(-np.log2(likely[held_out]))
 
 
 def _evidence(counts: Array, lower: Array, totals: Array, weight: float) -> float:

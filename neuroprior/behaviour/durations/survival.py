@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from scipy import special
 
+from neuroprior._statistics import Interval
 from neuroprior.behaviour.analysis.comparison import units
 from neuroprior.behaviour.analysis.permutation_design import PermutationDesign
 from neuroprior.behaviour.analysis.permutation_tests import combine_tests
@@ -50,11 +51,14 @@ class DurationSurvival:
         curves: by behaviour and condition ("" without conditions).
         tests: by behaviour the log-rank test's p-value, and that corrected for the number of behaviours; empty where
             nothing can be tested.
+        ratios: of two conditions, by behaviour: how many times as long its bouts last under the second as under the
+            first (restricted means), with its 95 % interval over units; empty where nothing can be tested.
         design: what was permuted; None without conditions.
     """
 
     curves: Mapping[tuple[str, str], Curve]
     tests: Mapping[str, tuple[float, float]]
+    ratios: Mapping[str, Interval]
     design: PermutationDesign | None
 
     def __repr__(self) -> str:
@@ -74,13 +78,19 @@ class DurationSurvival:
         return pd.concat(parts, ignore_index=True)
 
     def medians(self) -> pd.DataFrame:
-        """Return a row a behaviour: `behaviour`, the median under each condition, `p_value, corrected`."""
+        """Return a row a behaviour: `behaviour`, the median under each condition, `p_value, corrected`.
+
+        Of two conditions there are `ratio, low, high`, too.
+        """
         rows: dict[str, dict[str, object]] = {}
         for (behaviour, level), curve in self.curves.items():
             rows.setdefault(behaviour, {"behaviour": behaviour})[f"median, {level}".removesuffix(", ")] = curve.median
         frame = pd.DataFrame(list(rows.values()))
-        for place, name in enumerate(("p_value", "corrected")):
-            frame[name] = [self.tests.get(behaviour, (np.nan, np.nan))[place] for behaviour in frame["behaviour"]]
+        columns: dict[tuple[str, ...], Mapping[str, tuple[float, ...]]] = {("p_value", "corrected"): self.tests}
+        columns |= {("ratio", "low", "high"): self.ratios} if self.ratios else {}
+        for names, values in columns.items():
+            for place, name in enumerate(names):
+                frame[name] = [values[key][place] if key in values else np.nan for key in frame["behaviour"]]
         return frame
 
 
@@ -93,6 +103,8 @@ def duration_survival(
     (jackknife), on the scale log(-log S). The test is the log-rank test (Mantel 1966): observed less expected ends,
     where what is expected is the hazard of the stratum, or in paired designs of the subject. Its null distribution is
     that of permuted conditions of whole units (see `PermutationDesign`), so that bouts of a subject may be alike.
+    The ratio is of the areas below the two curves, up to the longest bout of the condition whose bouts are shorter.
+    Units count so that each stratum has the same weight under both conditions.
 
     Args:
         plans: with durations; a condition is compared within strata, where there are any.
@@ -126,18 +138,20 @@ def duration_survival(
             own = (action == number) & (level == place)
             curves[names[number], levels[place]] = survival_curve(time[own], ended[own], unit[own])
     if plans.condition is None:
-        return DurationSurvival(curves, {}, None)
+        return DurationSurvival(curves, {}, {}, None)
     design = PermutationDesign.of(plans)
     if design.untestable:
-        return DurationSurvival(curves, {}, design)
+        return DurationSurvival(curves, {}, {}, design)
     labels = design.labellings(permutations, generator)
     block = design.block.numpy()[plan]
-    statistics = {}
+    statistics, ratios = {}, dict[str, Interval]()
     for number in np.flatnonzero(np.bincount(action[ended & (block >= 0)], minlength=len(names))):
         own = (action == number) & (block >= 0)
         ends, expected = _count_ends(time[own], ended[own], block[own], design.cell.numpy())
         statistics[names[number]] = _log_rank(ends, expected, labels, len(design.conditions))
-    return DurationSurvival(curves, combine_tests(statistics)[0], design)
+        if len(np.unique(level)) == 2 == len(np.unique(level[own & ended])):
+            ratios[names[number]] = _ratio_of_means(time[own], ended[own], block[own], design)
+    return DurationSurvival(curves, combine_tests(statistics)[0], ratios, design)
 
 
 def survival_curve(time: Array, ended: NDArray[np.bool_], unit: Numbers) -> Curve:
@@ -148,14 +162,8 @@ def survival_curve(time: Array, ended: NDArray[np.bool_], unit: Numbers) -> Curv
         ended: bool `[n]`: whether it ended then.
         unit: int `[n]`.
     """
-    at = np.unique(time[ended])
     of_unit, numbers = pd.factorize(unit)
-    ends, at_risk = np.zeros((2, len(numbers), len(at)))
-    place = np.searchsorted(at, time, "right") - 1
-    np.add.at(ends, (of_unit[ended], place[ended]), 1)
-    seen = place >= 0
-    np.add.at(at_risk, (of_unit[seen], place[seen]), 1)
-    at_risk = at_risk[:, ::-1].cumsum(1)[:, ::-1]
+    at, ends, at_risk = _count_by_unit(time, ended, of_unit, len(numbers))
     whole = _survive(ends.sum(0), at_risk.sum(0))
     low = high = np.full(len(at), np.nan)
     if len(numbers) > 1:
@@ -168,8 +176,19 @@ def survival_curve(time: Array, ended: NDArray[np.bool_], unit: Numbers) -> Curv
     return Curve(at, whole, low, high, at_risk.sum(0))
 
 
+def _count_by_unit(time: Array, ended: NDArray[np.bool_], unit: Numbers, units: int) -> tuple[Array, Array, Array]:
+    """Return the times `[T]` at which bouts ended, and how many of each unit ended, and were at risk, then `[G, T]`."""
+    at = np.unique(time[ended])
+    ends, at_risk = np.zeros((2, units, len(at)))
+    place = np.searchsorted(at, time, "right") - 1
+    np.add.at(ends, (unit[ended], place[ended]), 1)
+    seen = place >= 0
+    np.add.at(at_risk, (unit[seen], place[seen]), 1)
+    return at, ends, at_risk[:, ::-1].cumsum(1)[:, ::-1]
+
+
 def _survive(ends: Array, at_risk: Array) -> Array:
-    survival: Array = (1 - ends / np.maximum(at_risk, 1)).cumprod(-1)
+    survival: Array = (1 - ends / np.where(at_risk > 0, at_risk, 1)).cumprod(-1)
     return survival
 
 
@@ -193,3 +212,33 @@ def _log_rank(ends: Array, expected: Array, labels: torch.Tensor, conditions: in
         under = (labels == condition).double()
         total += (excess @ under).square() / (due @ under).clamp(min=1e-9)
     return total
+
+
+def _ratio_of_means(time: Array, ended: NDArray[np.bool_], block: Numbers, design: PermutationDesign) -> Interval:
+    """Return how many times as long bouts last under the second of two conditions: their restricted means' ratio.
+
+    The interval leaves out one unit at a time, on the scale of logarithms.
+    """
+    unit, label, cell = (one.numpy() for one in (design.unit, design.label, design.cell))
+    units, under = len(design.units), label[block]
+    limit = min(time[under == condition].max() for condition in (0, 1))
+    kept = np.arange(units) != np.arange(-1, units)[:, None]  # [G + 1, G]: all, then without each unit
+    logs = []
+    for condition in (0, 1):
+        own, blocks = under == condition, np.flatnonzero(label == condition)
+        at, ends, at_risk = _count_by_unit(time[own], ended[own], unit[block[own]], units)
+        remaining = kept[:, unit[blocks]].astype(np.float64)
+        number = remaining @ (cell[blocks][:, None] == cell[blocks])
+        weight = np.zeros(kept.shape)
+        weight[:, unit[blocks]] = remaining * np.bincount(cell)[cell[blocks]] / number.clip(min=1)
+        survival = _survive(weight @ ends, weight @ at_risk)[:, at < limit]
+        widths = np.diff(at[at < limit], prepend=0, append=limit)
+        logs.append(np.log(widths[0] + survival @ widths[1:]))
+    change = logs[1] - logs[0]
+    group = np.zeros(units, np.int64)  # of units that might exchange places
+    if design.kind == "between":
+        group[unit] = np.unique(cell * 2 + label, return_inverse=True)[1]
+    size = np.bincount(group)
+    share = (size.clip(min=2) - 1) / size
+    half = special.stdtrit(units - len(size), 0.975) * np.sqrt(share[group] @ (change[1:] - change[0]) ** 2)
+    return Interval(*np.exp([change[0], change[0] - half, change[0] + half]).tolist())

@@ -1,7 +1,6 @@
 """The section on durations: how long actions take, by which law, and whether that predicts the next action."""
 
 from collections.abc import Iterator
-from math import log
 from typing import Any
 
 import numpy as np
@@ -9,31 +8,28 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from neuroprior._statistics import ENOUGH_UNITS, ratio_difference
+from neuroprior._statistics import LEVEL, holm, ratio_difference
 from neuroprior.behaviour.analysis.comparison import Score, score_bits, too_few, unit_name
+from neuroprior.behaviour.analysis.lags import MAX_FOLDS, actions_in_a_row, bits_after, bits_held_out, bits_of_shares
 from neuroprior.behaviour.durations.duration_model import DurationModel
 from neuroprior.behaviour.durations.laws import resolution
 from neuroprior.behaviour.durations.survival import duration_survival
 from neuroprior.behaviour.recorded_plans import RecordedPlans, action_names, durations_of
 from neuroprior.behaviour.reporting import figures
 from neuroprior.behaviour.reporting.document import Column, table
+from neuroprior.behaviour.reporting.findings import Finding, p_words
 from neuroprior.behaviour.reporting.fits import ACTIONS, DURATIONS
 from neuroprior.behaviour.reporting.page import FigureBox, Section
-from neuroprior.behaviour.reporting.part import LISTED, Part, p_text
+from neuroprior.behaviour.reporting.part import LISTED, Part, p_text, without_verdict
 from neuroprior.behaviour.reporting.scores import Evaluation
 from neuroprior.behaviour.reporting.survival import survival_figure, survival_findings, survival_table
-from neuroprior.plans import BLOCKS, FEWEST_UNITS, Plans, divisible, folds, in_parts
+from neuroprior.plans import BLOCKS, FEWEST_UNITS, divisible, folds, in_parts
 from neuroprior.plans.folds import num_units
-from neuroprior.priors import MarkovPrior
-from neuroprior.priors.counts.markov import blend
 
 FOLDS = 5
 
 CLASSES = 3
 """Classes of the last duration: short, medium and long for its action."""
-
-PSEUDO_COUNTS = [2.0**k for k in range(21)]
-"""Weights of the chain without durations; the likeliest is taken."""
 
 MOST_ACTIONS = 500
 """Kinds of actions up to which the next one is counted after each with each class of duration."""
@@ -41,7 +37,7 @@ MOST_ACTIONS = 500
 MOST_BINS = 30
 
 LEAST = 5e-4
-"""Gains below this are 0 in three digits, and not starred."""
+"""Bits; gains below this are 0 in three digits, and not starred."""
 
 
 def duration_section(found: Evaluation) -> Part | None:
@@ -59,8 +55,7 @@ def duration_section(found: Evaluation) -> Part | None:
     dwell = dwell_times(plans, model)
     following = _following(found, plans, known)
     over = unit_name(plans, known)
-    few = f" Nothing is starred: there are fewer than {ENOUGH_UNITS} {over}."
-    star = f"*: above 0 by its 95 % interval over {over}."
+    bounds = f"±: 95 % intervals over {over}."
     of_all = f" The {LISTED} commonest of {len(frame)}." if len(frame) > LISTED else ""
     columns: dict[str, Column] = {
         "action": "action",
@@ -76,34 +71,36 @@ def duration_section(found: Evaluation) -> Part | None:
     caption = (
         "Dwell times in the unit of the file. law: of durations above 0, chosen by held-out likelihood (of all: too few"
         " for a law of its own). gain: of this"
-        f" over an exponential law, nats per held-out duration. {star}{of_all}"
+        f" over an exponential law, nats per held-out duration. {bounds}{of_all}"
     )
     tables = [table(frame[:LISTED], columns, caption, "Durations", "lrrrrrrlr")]
-    shown: dict[str, Column] = {"laws": "what", "nats per duration": _gain, "p": _p}
+    shown: dict[str, Column] = {"laws": "what", "nats per duration": _gain}
     caption = (
         "Over exponential laws of each action, and over the laws of the line above: durations may depend on the next"
     )
-    caption += f" action, too, where that predicts them better. {star}"
-    tables.append(table(laws, shown, caption, "Laws of durations", "lrr"))
+    caption += f" action, too, where that predicts them better. {bounds}"
+    tables.append(table(laws, shown, caption, "Laws of durations", "lr"))
+    too_few_units = too_few(found.plans)
     if len(following):
-        shown = {"model": "model", "without": "without:.4f", "with": "with:.4f", "gain": _gain, "p": _p}
-        caption = f"Bits per held-out action without and with the last duration known. {star}"
-        tables.append(table(following, shown, caption, "Whether durations predict the next action", "lrrrr"))
-    enough = bool(len(following)) and bool((following["units"] >= ENOUGH_UNITS).all())
+        shown = {"model": "model", "without": "without:.4f", "with": "with:.4f", "gain": _gain}
+        caption = f"Bits per held-out action without and with the last duration known. {bounds}"
+        if not too_few_units:
+            shown["p"] = lambda row: p_text(row.corrected) + "*" * row.starred
+            caption += " p: of a gain, corrected for the models (Holm). *: p < 0.05."
+        tables.append(table(following, shown, caption, "Whether durations predict the next action"))
     text = [
         "Exponential laws are those of a process without memory, in which a long stay says nothing of when it ends."
         " Where another law predicts durations better, actions have typical lengths, or bursts and pauses.",
         "Whether durations predict the next action: a chain of order 1 with back-off, and the same with how long the"
         f" last action took, in {CLASSES} classes by its own action's terciles in the training plans. Where the gain is"
         " above 0, durations carry information that a model of actions alone does not have.",
+        *([without_verdict(too_few_units)] if too_few_units else []),
     ]
-    text[-1] += "" if enough else few
     figure = figures.dwell_figure(dwell)
     caption = "Density of the logarithm of durations above 0 (bars), and of the law that was fitted (line)."
     box = FigureBox(figure, caption, "Dwell times of the actions with their laws.", "dwell")
     frames = {"durations": frame, "duration_laws": laws, "next_by_duration": following, "dwell": dwell}
     survival = duration_survival(found.plans, generator=torch.Generator().manual_seed(0))
-    too_few_units = too_few(found.plans)
     frames |= {"survival": survival.frame(), "survival_tests": survival.medians()}
     tables.append(survival_table(survival, too_few_units))
     caption = (
@@ -116,7 +113,7 @@ def duration_section(found: Evaluation) -> Part | None:
         ),
     ]
     unit = found.recordings.unit if found.recordings is not None else ""
-    findings = survival_findings(survival, too_few_units, unit)
+    findings = [*_following_findings(following), *survival_findings(survival, too_few_units, unit)]
     return Part(Section("Durations", text, tables, boxes), frames, findings=findings)
 
 
@@ -205,7 +202,27 @@ def _following(found: Evaluation, plans: RecordedPlans, known: Tensor) -> pd.Dat
         plain = next((one for one in found.models if (one.name, one.inputs) == (model.name, ACTIONS)), None)
         if model.inputs == DURATIONS and plain is not None:
             rows.append({"model": model.name} | _compared(plain.score, model.score))
-    return pd.DataFrame(rows)
+    frame = pd.DataFrame(rows)
+    if rows:
+        # A loss, or a gain that is 0 in three digits, is none that was looked for.
+        frame["corrected"] = holm(frame["p_value"].where(frame["gain"] >= LEAST, 1.0))
+        frame["starred"] = (frame["corrected"] < LEVEL) & (not too_few(found.plans))
+    return frame
+
+
+def _following_findings(following: pd.DataFrame) -> list[Finding]:
+    """A finding for each model: whether it gains by the last duration."""
+    found = []
+    for row in following.to_dict("records"):
+        gain, low, high, p, corrected = (float(row[what]) for what in ("gain", "low", "high", "p_value", "corrected"))
+        feature = f"next behaviour by duration, {row['model']}"
+        sentence = (
+            f"How long the last behaviour took adds {gain:.3g} bits to the prediction of the next one"
+            f" ({row['model']}), 95 % interval {low:.3g} to {high:.3g}; {p_words(corrected)}."
+        )
+        estimate = (gain, low, high, p, corrected, bool(row["starred"]))
+        found.append(Finding(feature, "next behaviour by duration", feature, *estimate, sentence))
+    return found
 
 
 def _compared(without: Score, known: Score) -> dict[str, Any]:
@@ -217,58 +234,35 @@ def _compared(without: Score, known: Score) -> dict[str, Any]:
 def chain_bits(plans: RecordedPlans, known: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
     """The held-out bits of each action under a chain of order 1, and under one that knows the last duration.
 
-    The second counts the actions after each action with each class of its duration, and backs off to the first with
-    pseudo-counts (MacKay and Peto 1995), as many as make the training plans most probable.
+    The second counts the actions after each action with each class of its duration, and backs off to the first as the
+    chains of `how_far_back` do.
 
     Args:
         plans: N of them, with durations.
         known: `[N, L]` bool: where durations are known.
 
     Returns:
-        Both `[N, L]`, float64; and where they have values: after a known duration, in folds that could be learned from.
+        Both `[N, L]`, float64; and where they have values: after a known duration, if others can be learned from.
     """
-    without, knowing = (torch.zeros(known.shape, dtype=torch.double) for _ in range(2))
-    mask, size = torch.zeros_like(known), plans.num_actions
-    for training, held_out in _parts(plans, known):
-        chain = MarkovPrior(size, 1).fit(Plans(training.actions, size, training.lengths))
-        lower = chain.transition_matrix().double()[:, None].expand(size, CLASSES, size)
-        edges = _edges(training)
-        last, classes, after, _ = _pairs(training, edges)
-        counts = torch.zeros(size, CLASSES, size, dtype=torch.double)
-        counts.index_put_((last, classes, after), torch.ones(len(last), dtype=torch.double), accumulate=True)
-        weight = max(PSEUDO_COUNTS, key=lambda one: _evidence(counts, lower, one))
-        probs = blend(counts, lower, "dirichlet", weight, lower)
-        last, classes, after, here = _pairs(plans[held_out], edges)
-        for bits, likely in ((without, lower), (knowing, probs)):
-            own = -likely[last, classes, after].log() / log(2)
-            bits[held_out] = bits[held_out].masked_scatter(here, own)
-        mask[held_out] = here
-    return (without, knowing), mask
-
-
-def _edges(plans: RecordedPlans) -> Tensor:
-    """`[A, CLASSES - 1]`: the quantiles of the known durations of each action that divide it into classes."""
-    known = plans.mask() & ~durations_of(plans).isnan()
-    times = pd.DataFrame({"action": plans.actions[known].tolist(), "time": durations_of(plans)[known].tolist()})
-    shares = np.arange(1, CLASSES) / CLASSES
-    found = times.groupby("action")["time"].quantile(shares).unstack().reindex(range(plans.num_actions))
-    return torch.tensor(found.fillna(np.inf).to_numpy(np.float64))
-
-
-def _pairs(plans: RecordedPlans, edges: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Of each action after a known duration: the last action, the class of its duration, the action; and where."""
-    times = durations_of(plans)[:, :-1]
-    here = plans.mask()[:, 1:] & ~times.isnan()
-    last, after = plans.actions[:, :-1][here].long(), plans.actions[:, 1:][here].long()
-    classes = (times[here].double()[:, None] > edges[last]).sum(1)
-    return last, classes, after, torch.nn.functional.pad(here, (1, 0))
-
-
-def _evidence(counts: Tensor, lower: Tensor, weight: float) -> float:
-    """The log-probability of counts `[..., A]` under a Dirichlet prior of `weight` pseudo-counts, spread as `lower`."""
-    total, some = counts.sum(-1), counts > 0
-    own = torch.lgamma(counts[some] + weight * lower[some]) - torch.lgamma(weight * lower[some])
-    return float((torch.lgamma(torch.tensor(weight).double()) - torch.lgamma(total + weight)).sum() + own.sum())
+    actions, step, unit = actions_in_a_row(plans)
+    fold, last, mask = unit % MAX_FOLDS, np.roll(actions, 1), plans.mask().cpu()
+    time = np.roll(durations_of(plans).masked_fill(~known, torch.nan).cpu()[mask].double().numpy(), 1)
+    after_known = (step > 0) & ~np.isnan(time)
+    without = bits_after(last, actions, fold, bits_of_shares(actions, fold, plans.num_actions), step > 0)
+    knowing, scored = without.copy(), np.zeros_like(after_known)
+    for number in np.unique(fold):
+        training, held_out = after_known & (fold != number), after_known & (fold == number)
+        if not training.any():
+            continue
+        times = pd.Series(time[training]).groupby(last[training])
+        edges = times.quantile(np.arange(1, CLASSES) / CLASSES).unstack().reindex(range(plans.num_actions))
+        classes = (time[:, None] > edges.to_numpy()[last]).sum(1)
+        knowing[held_out] = bits_held_out(last * CLASSES + classes, actions, training, held_out, without)
+        scored |= held_out
+    spread = [torch.zeros(mask.shape, dtype=torch.double) for _ in range(3)]
+    for values, whole in zip((without, knowing, scored), spread, strict=True):
+        whole[mask] = torch.from_numpy(values).double()
+    return (spread[0], spread[1]), spread[2] > 0
 
 
 def dwell_times(plans: RecordedPlans, model: DurationModel) -> pd.DataFrame:
@@ -316,12 +310,5 @@ def _bins(times: Any, step: float) -> Any:
 
 
 def _gain(row: Any) -> str:
-    """A gain with its interval; starred where it is above 0, if there are enough units."""
-    if pd.isna(row["gain"]):
-        return ""
-    star = "*" if row["units"] >= ENOUGH_UNITS and row["low"] >= LEAST else " "
-    return f"{row['gain']:+.3f}±{row['high'] - row['gain']:.3f}{star}"
-
-
-def _p(row: Any) -> str:
-    return "" if pd.isna(row["p_value"]) or row["units"] < ENOUGH_UNITS else p_text(row["p_value"])
+    """A gain with its interval."""
+    return "" if pd.isna(row["gain"]) else f"{row['gain']:+.3f}±{row['high'] - row['gain']:.3f}"

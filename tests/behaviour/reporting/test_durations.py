@@ -193,10 +193,26 @@ def test_no_duration_of_the_action_itself_or_later_is_used():
         assert step == 59 or not after[mine].equal(before[mine])
 
 
+def test_stars_are_findings():
+    """Of the tables of gains only what durations say of the next action is starred; a single animal has no gain."""
+    for telling in (True, False):
+        part = section(timed(telling))
+        (finding,) = (one for one in part.findings if one.family == "next behaviour by duration")
+        row = part.frames["next_by_duration"].iloc[0]
+        assert (finding.effect, finding.low, finding.high, finding.p) == tuple(row[["gain", "low", "high", "p_value"]])
+        assert finding.p_corrected == (row["p_value"] if row["gain"] > 5e-4 else 1)
+        assert finding.starred == telling
+        for one in part.section.tables[:3]:
+            starred = [cell for row in one.rows for cell in row if "*" in cell]
+            assert bool(starred) == (telling and one.title == "Whether durations predict the next action")
+    alone = replace(timed(True), group=torch.zeros(24, dtype=torch.long))
+    assert tables(alone)["next_by_duration"]["units"].tolist() == [24]
+
+
 def test_few_units_give_no_verdict():
     plans = replace(timed(True), group=torch.arange(24) % 3)
     made = section(plans).section
-    assert "fewer than 5 groups" in " ".join(made.text)
+    assert "3 groups are too few for a verdict" in " ".join(made.text)
     assert "*" not in "".join(cell for table in made.tables for row in table.rows for cell in row)
 
 
