@@ -13,7 +13,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
 from neuroprior.behaviour.reporting.page import PAPER, STYLE, clean
@@ -23,6 +23,9 @@ Number = float | None
 
 Array = NDArray[np.float64]
 P = ParamSpec("P")
+
+DIGITS = FuncFormatter(lambda value, _: f"{value:g}")
+"""Numbers on a logarithmic axis in plain digits: matplotlib's own are formulas."""
 
 WIDTH = 7.5
 """Width of a figure, inches: that of a column of text."""
@@ -88,8 +91,8 @@ def colors(names: Sequence[str]) -> Iterator[str]:
 
 
 def level_colors(levels: Sequence[str]) -> dict[str, str]:
-    """A colour for each level of a factor, the spare ones in turn."""
-    return dict(zip(levels, cycle(SPARE), strict=False))
+    """A colour for each level of a factor, the same in whatever order they are given."""
+    return dict(zip(sorted(levels), cycle(SPARE), strict=False))
 
 
 def lines(names: Sequence[str]) -> Iterator[tuple[str, str]]:
@@ -199,3 +202,13 @@ def legend(figure: Figure, entries: Sequence[Artist]) -> None:
     """A legend above the axes, from the left: there it covers nothing, and a phone shows it first."""
     if entries:
         figure.legend(handles=entries, loc="outside upper left", ncols=3, handletextpad=0.5, columnspacing=1.6)
+
+
+def decades(axes: Axes, low: float, high: float) -> None:
+    """Put three to six numbers on a logarithmic axis across, in plain digits."""
+    span = np.log10(high / low)
+    steps = (1, 2, 5) if span < 1.2 else (1, 3) if span < 2.2 else (1,)
+    axes.set_xlim(low, high)
+    axes.xaxis.set_major_locator(LogLocator(subs=steps, numticks=6))
+    axes.xaxis.set_major_formatter(DIGITS)
+    axes.minorticks_off()

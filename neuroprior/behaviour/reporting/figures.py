@@ -15,11 +15,12 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
 from neuroprior.behaviour.recorded_plans import RecordedPlans, action_names, group_names
 from neuroprior.behaviour.reporting.drawing import (
+    DIGITS,
     FEWER,
     MORE,
     PLAIN,
@@ -29,6 +30,7 @@ from neuroprior.behaviour.reporting.drawing import (
     at_edges,
     band,
     colors,
+    decades,
     dot,
     drawn,
     expect_some,
@@ -59,9 +61,6 @@ OTHER = "#7d838c"
 
 INPUT_STYLES = {"actions": ("o", True), "actions and context": ("o", False), "actions and durations": ("D", False)}
 """How a dot of a model with an input is drawn: its marker, and whether it is hollow."""
-
-DIGITS = FuncFormatter(lambda value, _: f"{value:g}")
-"""Numbers on a logarithmic axis in plain digits: matplotlib's own are formulas."""
 
 DEEPEST = 0.8
 """Opacity of the deepest colour: black text in light and white text in dark stay legible on it."""
@@ -178,23 +177,13 @@ def dwell_figure(dwell: pd.DataFrame) -> Figure:
         at_zero = f", {100 * zero:.0f} % at 0" if zero else ""
         axes.set_title(f"{short(str(name), 20)}\n{own['law'].iloc[0]}{at_zero}", fontsize=9)
         axes.set_xscale("log")
-        _decades(axes, low.min(), high.max())
+        decades(axes, low.min(), high.max())
         axes.set(yticks=[], ylim=(0, None))
         axes.spines["left"].set_visible(False)
     at_edges(cells, len(shown), across, "duration", "density")
     if len(shown) < len(actions):
         figure.suptitle(f"the {len(shown)} commonest of {len(actions)} actions", fontsize=10, x=0.01, ha="left")
     return figure
-
-
-def _decades(axes: Axes, low: float, high: float) -> None:
-    """Three to six numbers on a logarithmic axis across, in plain digits."""
-    span = np.log10(high / low)
-    steps = (1, 2, 5) if span < 1.2 else (1, 3) if span < 2.2 else (1,)
-    axes.set_xlim(low, high)
-    axes.xaxis.set_major_locator(LogLocator(subs=steps, numticks=6))
-    axes.xaxis.set_major_formatter(DIGITS)
-    axes.minorticks_off()
 
 
 @drawn

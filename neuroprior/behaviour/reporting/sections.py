@@ -158,7 +158,8 @@ def lag_section(found: Evaluation) -> Part | None:
     findings, verdicts = list[Finding](), list[str]()
     if result is not None:
         frame = frames["how_far_back"] = result.frame()
-        findings, verdicts = _lag_findings(frame), [] if result.few else [result.verdict]
+        findings = _lag_findings(frame, result.verdict)
+        verdicts = [] if result.few or findings[0].starred else [result.verdict]
         text += [without_verdict(result.few) or result.verdict]
         columns: dict[str, Column] = {
             "lag": "lag",
@@ -185,17 +186,19 @@ def lag_section(found: Evaluation) -> Part | None:
     return Part(Section("How far back", text, tables, boxes), frames, verdicts, findings)
 
 
-def _lag_findings(frame: pd.DataFrame) -> list[Finding]:
-    found = []
+def _lag_findings(frame: pd.DataFrame, verdict: str) -> list[Finding]:
+    """A finding for each lag; first the last one that adds, which is said with the verdict."""
+    found, reach = list[Finding](), int(frame["adds"].sum())
     for row in frame.to_dict("records"):
         gain, low, high, p, corrected = (float(row[what]) for what in ("bits", "low", "high", "p_value", "corrected"))
         feature = f"lag {row['lag']}"
         sentence = (
-            f"The behaviour {row['lag']} back adds {gain:.3g} bits to the prediction of the next one, 95 % interval"
-            f" {low:.3g} to {high:.3g}; {p_words(corrected)}."
+            f"Lag {row['lag']} adds {gain:.2g} bits, 95 % interval {low:.2g} to {high:.2g}; {p_words(corrected)}."
         )
+        if row["lag"] == reach:
+            sentence = f"{verdict} {sentence}"
         found.append(Finding(feature, "lags", feature, gain, low, high, p, corrected, bool(row["adds"]), sentence))
-    return found
+    return found[reach - 1 : reach] + found[: max(reach - 1, 0)] + found[reach:]
 
 
 def motif_section(found: Evaluation) -> Part | None:

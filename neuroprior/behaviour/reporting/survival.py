@@ -11,6 +11,7 @@ from neuroprior.behaviour.reporting.drawing import (
     PLAIN,
     WIDTH,
     at_edges,
+    decades,
     drawn,
     expect_some,
     floats,
@@ -105,6 +106,8 @@ def survival_figure(survival: pd.DataFrame) -> Figure:
             axes.fill_between(time, low, high, step="post", color=hues[level], alpha=0.2, lw=0)
         axes.set_title(short(str(behaviour), 24), fontsize=9)
         axes.set(xscale="log", ylim=(0, 1.02))
+        times = floats(survival.loc[(survival["behaviour"] == behaviour) & (survival["time"] > 0), "time"])
+        decades(axes, times.min(), times.max())
     at_edges(cells, len(shown), across, "duration", "share that lasts longer")
     legend(figure, [marker(hues[level], False, short(str(level), 24)) for level in levels if level])
     return figure
