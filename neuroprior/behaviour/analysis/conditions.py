@@ -3,13 +3,14 @@
 Everything is tested by permuting what is independent (see `neuroprior.behaviour.analysis.permutation_design`).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import combinations
 from math import lcm, nan
 
 import numpy as np
+import pandas as pd
 import torch
 from scipy.special import stdtrit
 from torch import Tensor
@@ -21,9 +22,16 @@ from neuroprior.behaviour.analysis.flat import FlatPlans, ranks
 from neuroprior.behaviour.analysis.interaction import ConditionInteraction, compare_strata
 from neuroprior.behaviour.analysis.permutation_design import PermutationDesign
 from neuroprior.behaviour.analysis.permutation_tests import TIE, combine_tests, largest_statistics, shares_reaching
-from neuroprior.behaviour.recorded_plans import RecordedPlans, numbered_names
+from neuroprior.behaviour.recorded_plans import RecordedPlans, action_names, numbered_names
+from neuroprior.behaviour.recordings import Recordings
 from neuroprior.plans.columns import listed
 from neuroprior.plans.plans import check_are_plans
+
+FAMILIES = {"transitions": "{}", "durations": "duration of {}", "actions": "share of {}", "sequences": "{}"}
+"""How features of each family are called; families in the order in which they are listed.
+
+Where a transition changes, so do the shares of its actions, and of the sequences that hold it: these come last.
+"""
 
 FEWEST_PERMUTATIONS = 999
 """Permutations that are made whatever they cost."""
@@ -100,7 +108,7 @@ class ConditionPrediction:
     log_odds: Tensor
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ConditionComparison:
     """Whether behaviour differs between conditions.
 
@@ -121,6 +129,7 @@ class ConditionComparison:
         contrasts: of more than two conditions, the comparison of each two of them, with p-values that are corrected for
             the number of pairs; in their order, those that cannot be tested left out.
         interaction: whether the difference depends on the stratum; None without strata, or with too few units.
+        action_names: A of them.
     """
 
     design: PermutationDesign
@@ -136,6 +145,41 @@ class ConditionComparison:
     verdict: str
     contrasts: list["ConditionComparison"] = field(default_factory=list)
     interaction: ConditionInteraction | None = None
+    action_names: Sequence[str] = ()
+
+    def __repr__(self) -> str:
+        """Return the verdict."""
+        return f"ConditionComparison({self.verdict})"
+
+    def frame(self) -> pd.DataFrame:
+        """Return a row a feature, those that differ most first.
+
+        The columns are `family`, `parts` (a feature's actions), `feature` (its name), `mean, low, high` of each
+        condition (such as `mean, drug`), of two conditions `difference` with `low` and `high`, `p_value`, `corrected`
+        for the family, `significant` and `statistic`. Durations are geometric means and ratios.
+        """
+        if not self.families:
+            return pd.DataFrame(columns=["family", "parts", "feature", "p_value", "corrected", "significant"])
+        frame = pd.concat([self._rows(family) for family in self.families], ignore_index=True)
+        rank = frame["family"].map({name: place for place, name in enumerate(FAMILIES)})
+        keys = {"rank": rank.where(frame["significant"], len(FAMILIES)), "size": -frame["statistic"]}
+        frame = frame.assign(**keys).sort_values(["rank", "corrected", "p_value", "size"], kind="stable")
+        return frame.drop(columns=list(keys)).reset_index(drop=True)
+
+    def _rows(self, family: ConditionFamily) -> pd.DataFrame:
+        scaled = np.exp if family.name == "durations" else np.asarray
+        rows = pd.DataFrame({"family": family.name, "place": range(len(family.features))})
+        rows["parts"] = [[self.action_names[action] for action in feature] for feature in family.features.tolist()]
+        rows["feature"] = feature_names(family.name, rows["parts"])
+        for name, *values in zip(self.condition_names, family.means, family.low, family.high, strict=True):
+            for what, numbers in zip(("mean", "low", "high"), values, strict=True):
+                rows[f"{what}, {name}"] = scaled(numbers.numpy())
+        if len(self.condition_names) == 2:
+            for what, numbers in zip(("difference", "low", "high"), family.difference, strict=True):
+                rows[what] = scaled(numbers.numpy())
+        rows["p_value"], rows["corrected"] = family.p_values.numpy(), family.corrected.numpy()
+        rows["significant"], rows["statistic"] = self.significant(family).numpy(), family.statistic.numpy()
+        return rows
 
     def differs(self, name: str) -> bool:
         """Whether the test of this name is significant, corrected; never where there are too few units."""
@@ -146,8 +190,14 @@ class ConditionComparison:
         return (family.corrected < LEVEL) & self.differs(family.name)
 
 
+def feature_names(family: str, features: Iterable[Sequence[str]]) -> list[str]:
+    """Return what features of a family are called, from the names of their actions."""
+    joint = " → " if family == "transitions" else " "
+    return [FAMILIES[family].format(joint.join(actions)) for actions in features]
+
+
 def compare_conditions(
-    plans: RecordedPlans, permutations: int = 9_999, generator: torch.Generator | None = None
+    plans: RecordedPlans | Recordings, permutations: int = 9_999, generator: torch.Generator | None = None
 ) -> ConditionComparison:
     """Whether behaviour differs between the conditions of plans.
 
@@ -186,6 +236,8 @@ def compare_conditions(
         >>> found.p_value < 0.05
         True
     """
+    if isinstance(plans, Recordings):
+        plans = plans.plans()
     check_are_plans(plans)
     plans = RecordedPlans.of(plans)
     check_sizes(permutations=permutations)
@@ -252,6 +304,7 @@ def _compare(
         conclusive,
         verdict,
         interaction=interaction,
+        action_names=action_names(plans),
     )
 
 

@@ -1,8 +1,7 @@
 """The section on conditions: whether behaviour differs between them, and in what."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 
-import numpy as np
 import pandas as pd
 import torch
 
@@ -12,6 +11,7 @@ from neuroprior.behaviour.analysis.conditions import (
     ConditionFamily,
     ConditionPrediction,
     compare_conditions,
+    feature_names,
 )
 from neuroprior.behaviour.analysis.interaction import ConditionInteraction
 from neuroprior.behaviour.recorded_plans import action_names, group_names
@@ -24,12 +24,6 @@ from neuroprior.behaviour.reporting.scores import Evaluation
 from neuroprior.plans.columns import listed
 
 DRAWN = 8  # features in the figure
-
-FAMILIES = {"transitions": "{}", "durations": "duration of {}", "actions": "share of {}", "sequences": "{}"}
-"""How features of each family are called; families in the order in which they are listed.
-
-Where a transition changes, so do the shares of its actions, and of the sequences that hold it: these come last.
-"""
 
 TESTS = {
     "actions": "shares of actions",
@@ -51,7 +45,7 @@ def condition_section(found: Evaluation) -> Part | None:
         empty = {name: pd.DataFrame() for name in names}
         return Part(Section("Conditions", [result.verdict]), empty, [result.verdict])
     actions, units = action_names(found.plans), _unit_names(result, found)
-    tests, features = _tests(result), _features(result, actions)
+    tests, features = _tests(result), result.frame()
     blocks = _blocks(result, result.prediction, units)
     frames = dict(zip(names, (tests, features.drop(columns="parts"), blocks), strict=True))
     tables = [
@@ -60,7 +54,7 @@ def condition_section(found: Evaluation) -> Part | None:
         _block_table(result, result.prediction, blocks),
     ]
     if result.contrasts:
-        frames["condition_pairs"] = _pairs(result, actions)
+        frames["condition_pairs"] = _pairs(result)
         tables.append(_pair_table(result, frames["condition_pairs"]))
     if result.interaction is not None:
         frames["condition_interaction"] = _interaction(result.interaction, actions)
@@ -226,36 +220,6 @@ def _test_table(result: ConditionComparison, tests: pd.DataFrame) -> Table:
     return table(tests, columns, caption, "Do conditions differ?")
 
 
-def _features(result: ConditionComparison, actions: list[str]) -> pd.DataFrame:
-    """A row a feature, those that differ most first; durations as geometric means and ratios."""
-    parts = []
-    for family in result.families:
-        of_time = (lambda values: np.exp(values)) if family.name == "durations" else (lambda values: values)
-        part = pd.DataFrame({"family": family.name, "place": range(len(family.features))})
-        part["parts"] = [[actions[action] for action in feature] for feature in family.features.tolist()]
-        part["feature"] = _feature_names(family.name, part["parts"])
-        for name, *own in zip(result.condition_names, family.means, family.low, family.high, strict=True):
-            for what, values in zip(("mean", "low", "high"), own, strict=True):
-                part[f"{what}, {name}"] = of_time(values.numpy())
-        if len(result.condition_names) == 2:
-            for what, values in zip(("difference", "low", "high"), family.difference, strict=True):
-                part[what] = of_time(values.numpy())
-        part["p_value"], part["corrected"] = family.p_values.numpy(), family.corrected.numpy()
-        part["significant"], part["statistic"] = result.significant(family).numpy(), family.statistic.numpy()
-        parts.append(part)
-    frame = pd.concat(parts, ignore_index=True)
-    rank = frame["family"].map({name: place for place, name in enumerate(FAMILIES)})
-    keys = {"rank": rank.where(frame["significant"], len(FAMILIES)), "size": -frame["statistic"]}
-    frame = frame.assign(**keys).sort_values(["rank", "corrected", "p_value", "size"], kind="stable")
-    return frame.drop(columns=list(keys)).reset_index(drop=True)
-
-
-def _feature_names(family: str, features: Iterable[Sequence[str]]) -> list[str]:
-    """What features of a family are called, from the names of their actions."""
-    joint = " → " if family == "transitions" else " "
-    return [FAMILIES[family].format(joint.join(actions)) for actions in features]
-
-
 def _feature_table(result: ConditionComparison, features: pd.DataFrame) -> Table:
     columns: dict[str, Column] = {"feature": "feature"}
     for name in result.condition_names:
@@ -276,14 +240,12 @@ def _feature_table(result: ConditionComparison, features: pd.DataFrame) -> Table
     return table(shown, columns, caption, "What differs")
 
 
-def _pairs(result: ConditionComparison, actions: list[str]) -> pd.DataFrame:
+def _pairs(result: ConditionComparison) -> pd.DataFrame:
     """The features of each two conditions, as of `_features`, with both in the columns `first` and `second`."""
     parts = []
     for pair in result.contrasts:
         first, second = pair.condition_names
-        part = _features(pair, actions).rename(
-            columns={f"mean, {first}": "mean_first", f"mean, {second}": "mean_second"}
-        )
+        part = pair.frame().rename(columns={f"mean, {first}": "mean_first", f"mean, {second}": "mean_second"})
         tested = part["family"].map({name: corrected for name, (_, corrected) in pair.tests.items()})
         parts.append(part.assign(first=first, second=second, family_p=tested, all_p=pair.p_value))
     columns = ["first", "second", "family", "feature", "mean_first", "mean_second", "difference", "low", "high"]
@@ -315,7 +277,7 @@ def _interaction(found: ConditionInteraction, actions: list[str]) -> pd.DataFram
     parts = []
     for family in found.families:
         parts_of = [[actions[action] for action in feature] for feature in family.features.tolist()]
-        part = pd.DataFrame({"family": family.name, "feature": _feature_names(family.name, parts_of)})
+        part = pd.DataFrame({"family": family.name, "feature": feature_names(family.name, parts_of)})
         differences = family.differences.exp() if family.name == "durations" else family.differences
         for name, own in zip(found.stratum_names, differences, strict=True):
             part[f"difference, {name}"] = own.numpy()

@@ -609,3 +609,23 @@ def test_over_200_studies_false_alarms_are_5_percent(conditions, habit):
     low, high = stats.binom.interval(0.999, 200, 0.05)
     assert alarms.pop("family") <= high
     assert all(low <= number <= high for number in alarms.values()), alarms
+
+
+def test_the_frame_has_names_and_the_repr_is_short():
+    """Of two conditions with unlike means: differences of the second from the first, ratios of durations."""
+    generator = seeded(4)
+    condition = torch.arange(12) // 6
+    actions = torch.stack([torch.randint(2 + int(c), (40,), generator=generator) for c in condition])
+    seconds = (1.0 + condition[:, None]) * (0.5 + torch.rand(12, 40, generator=generator))
+    names = {"action_names": ("eat", "groom", "rest"), "condition_names": ("vehicle", "drug")}
+    plans = RecordedPlans(actions, 3, group=torch.arange(12), condition=condition, durations=seconds, **names)
+    result = compare_conditions(plans, 199, seeded(5))
+    frame = result.frame().set_index("feature")
+    assert frame["significant"].tolist() == sorted(frame["significant"], reverse=True)
+    share = torch.stack([(actions == 2)[condition == c].double().mean() for c in (0, 1)])
+    row = frame.loc["share of rest"]
+    assert (row["mean, vehicle"], row["mean, drug"]) == pytest.approx(tuple(share.tolist()), abs=0.02)
+    assert row["difference"] == pytest.approx(float(share[1] - share[0]), abs=0.02)
+    assert frame.loc["duration of eat", "difference"] == pytest.approx(2, abs=0.3)
+    assert frame.loc["eat → groom", "parts"] == ["eat", "groom"]
+    assert repr(result) == f"ConditionComparison({result.verdict})"

@@ -82,7 +82,7 @@ def test_a_report_has_its_tables_and_figures(made):
     assert {*made.tables, "motifs"} == {
         *("plans", "actions", "how_far_back", "lags", "transitions", "transition_test"),
         *("motifs", "drift", "drift_tests", "rate_drift"),
-        *("individuals", "individual_budget", "individual_types"),
+        *("individuals", "individual_budget", "individual_types", "individuality", "individuality_by_behaviour"),
     }
     assert all(isinstance(frame, pd.DataFrame) for frame in made.tables.values())
     assert {"scores", "lags", "transitions", "transition_graph", "individual_strips", "drift"} <= set(made.figures)
