@@ -365,9 +365,9 @@ def _fits_without_parts(
     step, found = resolution(time), []
     for some in torch.arange(parts + 1).split(max(AT_ONCE // max(len(time), 1), 1)):
         without, index = (part != some[:, None]).nonzero(as_tuple=True)
-        sets = Sets(time[index].log(), without * cells + cell[index], len(some) * cells, step)
-        count = sets.cell[~cut_off[index]].bincount(minlength=sets.number).view(-1, cells)
-        found.append((fit_laws(sets, laws, cut_off[index]).unflatten(1, (len(some), cells)), count))
+        sets = Sets(time[index].log(), without * cells + cell[index], len(some) * cells, step, cut_off[index])
+        count = sets.cell[~sets.cut_off].bincount(minlength=sets.number).view(-1, cells)
+        found.append((fit_laws(sets, laws).unflatten(1, (len(some), cells)), count))
     fits, counts = zip(*found, strict=True)
     return torch.cat(fits, 1), torch.cat(counts)
 

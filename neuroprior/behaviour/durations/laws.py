@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from math import log, pi, sqrt
 from typing import Literal, NamedTuple, get_args
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -27,8 +26,11 @@ NEWTON_STEPS, EM_STEPS = 20, 50
 MOST_VALUES = 150
 """The most values of a set that a mixture is fitted to; of more durations, means of neighbours."""
 
-NODES, CUT_OFF_STEPS, CONVERGED_CUT_OFF = 16, 50, 1e-6
-"""Longer durations that one stands for that was cut off; most steps until their law stays, and how near it must be."""
+CUT_OFF_STEPS, CONVERGED_CUT_OFF = 100, 1e-6
+"""Most steps until a law of durations that were cut off stays, and the relative change that counts as none."""
+
+SHAPE_STEP = 1e-4
+"""Relative change of a gamma law's shape by which its probabilities are differentiated."""
 
 CONVERGED = 1e-10
 """Relative change of a parameter in a Newton step with which iteration ends."""
@@ -47,17 +49,21 @@ class Sets(NamedTuple):
     cell: Tensor  # [n] int64: the set of each
     number: int  # C
     resolution: float  # what durations are multiples of; 0: of nothing
-    weight: Tensor | None = None  # [n] float64: how often each counts; None: once
+    cut_off: Tensor  # [n] bool: it is only known to be at least so long
 
     def sums(self, values: Tensor) -> Tensor:
         """`[C, ...]`: the sum of `values [n, ...]` over each set."""
-        if self.weight is not None:
-            values = values * self.weight.view(-1, *[1] * (values.dim() - 1))
         return values.new_zeros(self.number, *values.shape[1:]).index_add_(0, self.cell, values)
 
     def mean(self, values: Tensor) -> Tensor:
-        """`[C]`: the mean of `values [n]` over each set; NaN for an empty one."""
-        return self.sums(values) / self.sums(torch.ones_like(values))
+        """`[C, ...]`: the mean of `values [n, ...]` over each set; NaN for an empty one."""
+        number = self.sums(torch.ones_like(self.log))
+        return self.sums(values) / number.view(-1, *[1] * (values.dim() - 1))
+
+    def share_ended(self) -> Tensor:
+        """`[C]`: the share of durations that were not cut off; at least one is counted."""
+        ones = torch.ones_like(self.log)
+        return self.mean(1 - self.cut_off.double()).maximum(1 / self.sums(ones))
 
     def center(self) -> tuple[Tensor, Tensor]:
         """`[C]`: the mean and the standard deviation of the logarithms, the latter of at least `least`."""
@@ -100,19 +106,57 @@ def resolution(durations: Tensor) -> float:
 
 
 def _exponential(sets: Sets) -> Tensor:
-    return sets.mean(sets.log.exp())[:, None]
+    return (sets.mean(sets.log.exp()) / sets.share_ended())[:, None]
+
+
+def _fit_moments(
+    sets: Sets, moments: Tensor, maximise: Callable[[Tensor], Tensor], expect: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """The law `[C, K]` whose likelihood depends on two moments, by expectation maximisation.
+
+    What was cut off has the moments of longer durations of the law so far (Dempster, Laird and Rubin 1977).
+
+    Args:
+        sets: of durations.
+        moments: `[n, 2]`: of each duration; changed in place where it was cut off.
+        maximise: from means `[C, 2]` to parameters `[C, K]`.
+        expect: from parameters to moments, of each of the `[m]` durations that were cut off.
+    """
+    fit = maximise(sets.mean(moments))
+    for _ in range(CUT_OFF_STEPS if bool(sets.cut_off.any()) else 0):
+        moments[sets.cut_off] = expect(fit[sets.cell[sets.cut_off]])
+        before, fit = fit, maximise(sets.mean(moments))
+        if not bool(((fit - before).abs() > CONVERGED_CUT_OFF * fit.abs()).any()):
+            break
+    return fit
 
 
 def _gamma(sets: Sets) -> Tensor:
-    """Newton's method for the shape (Minka 2002, Estimating a gamma distribution)."""
-    mean, center = sets.mean(sets.log.exp()), sets.center()[0]
-    excess = (mean.log() - center).clamp(min=1e-12)
-    shape = (3 - excess + ((excess - 3).square() + 24 * excess).sqrt()) / (12 * excess)
-    for _ in range(NEWTON_STEPS):
-        slope = shape.square() * (1 / shape - torch.polygamma(1, shape))
-        shape = 1 / (1 / shape + (-excess + shape.log() - torch.digamma(shape)) / slope)
-        shape = shape.clamp(max=sets.least(center).square().reciprocal())
-    return torch.stack([shape, mean / shape], -1)
+    """From the means of durations and of their logarithms."""
+    least, time = sets.least(sets.center()[0]), sets.log.exp()
+    longer, log_longer = time[sets.cut_off], sets.log[sets.cut_off]
+
+    def maximise(means: Tensor) -> Tensor:
+        """Newton's method for the shape (Minka 2002, Estimating a gamma distribution)."""
+        mean, center = means.unbind(-1)
+        excess = (mean.log() - center).clamp(min=1e-12)
+        shape = (3 - excess + ((excess - 3).square() + 24 * excess).sqrt()) / (12 * excess)
+        for _ in range(NEWTON_STEPS):
+            slope = shape.square() * (1 / shape - torch.polygamma(1, shape))
+            shape = 1 / (1 / shape + (-excess + shape.log() - torch.digamma(shape)) / slope)
+            shape = shape.clamp(max=least.square().reciprocal())
+        return torch.stack([shape, mean / shape], -1)
+
+    def expect(of: Tensor) -> Tensor:
+        shape, scale = of.unbind(-1)
+        at, step = longer / scale, SHAPE_STEP * shape
+        above = torch.special.gammaincc(shape, at).clamp(min=torch.finfo(torch.double).tiny)
+        mean = scale * (shape + (shape * at.log() - at - torch.lgamma(shape)).exp() / above)
+        more, less = (torch.special.gammaincc(shape + sign * step, at) for sign in (1, -1))
+        log_mean = scale.log() + torch.digamma(shape) + (more - less) / (2 * step * above)
+        return torch.stack([mean.maximum(longer), log_mean.maximum(log_longer).minimum(mean.log())], -1)
+
+    return _fit_moments(sets, torch.stack([time, sets.log], -1), maximise, expect)
 
 
 def _weibull(sets: Sets) -> Tensor:
@@ -120,46 +164,84 @@ def _weibull(sets: Sets) -> Tensor:
     center, spread = sets.center()
     away = sets.log - center[sets.cell]
     most = pi / sqrt(6) / sets.least(center)
-    shape = pi / sqrt(6) / spread
+    shape, share = pi / sqrt(6) / spread, sets.share_ended()
+    ended = sets.mean(away.masked_fill(sets.cut_off, 0)) / share
     top = away.new_zeros(sets.number).scatter_reduce_(0, sets.cell, away, "amax")
     for _ in range(NEWTON_STEPS):
         weight = (shape[sets.cell] * (away - top[sets.cell])).exp()
         total = sets.sums(weight)
         first, second = sets.sums(weight * away) / total, sets.sums(weight * away.square()) / total
-        step = (first - 1 / shape) / (second - first.square() + shape.square().reciprocal())
+        step = (first - 1 / shape - ended) / (second - first.square() + shape.square().reciprocal())
         before, shape = shape, (shape - step).maximum(shape / 2).minimum(shape * 2).minimum(most)
         if not bool(((shape - before).abs() > CONVERGED * shape).any()):
             break
     weight = (shape[sets.cell] * (away - top[sets.cell])).exp()
-    return torch.stack([shape, (center + top + sets.mean(weight).log() / shape).exp()], -1)
+    return torch.stack([shape, (center + top + (sets.mean(weight) / share).log() / shape).exp()], -1)
 
 
 def _lognormal(sets: Sets) -> Tensor:
-    return torch.stack(sets.center(), -1)
+    center = sets.center()[0]
+    away = sets.log - center[sets.cell]
+    longer = away[sets.cut_off]
+
+    def maximise(means: Tensor) -> Tensor:
+        mean, square = means.unbind(-1)
+        return torch.stack([mean, (square - mean.square()).clamp(min=0).sqrt().maximum(sets.least(center + mean))], -1)
+
+    fit = _fit_moments(
+        sets,
+        torch.stack([away, away.square()], -1),
+        maximise,
+        lambda of: torch.stack(_longer_moments(longer, of[:, 0], of[:, 1])[1:], -1),
+    )
+    return torch.stack([center + fit[:, 0], fit[:, 1]], -1)
+
+
+def _longer_moments(value: Tensor, mean: Tensor, spread: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of normal variables above `value`: the log-probability of that, and then their mean and mean square."""
+    away = (value - mean) / spread
+    above = torch.special.log_ndtr(-away)
+    hazard = (-away.square() / 2 - log(2 * pi) / 2 - above).exp()
+    first = mean + spread * hazard
+    return above, first, mean * first + spread * (spread + value * hazard)
 
 
 def _two_lognormal(sets: Sets) -> Tensor:
     """Expectation maximisation on standardised logarithms, from two halves around their mean."""
     center, spread = sets.center()
-    value, number = _condensed((sets.log - center[sets.cell]) / spread[sets.cell], sets)
-    at_once = max(AT_ONCE // max(value.shape[1], 1), 1)
-    parts = zip(*(each.split(at_once) for each in (value, number, center, spread)), strict=True)
+    value = (sets.log - center[sets.cell]) / spread[sets.cell]
+    ended = _condensed(value[~sets.cut_off], sets.cell[~sets.cut_off], sets.number)
+    longer = _condensed(value[sets.cut_off], sets.cell[sets.cut_off], sets.number)
+    at_once = max(AT_ONCE // max(ended[0].shape[1] + longer[0].shape[1], 1), 1)
+    parts = zip(*(each.split(at_once) for each in (*ended, *longer, center, spread)), strict=True)
     return torch.cat([_two_normal(sets, *part) for part in parts])
 
 
-def _two_normal(sets: Sets, value: Tensor, number: Tensor, center: Tensor, spread: Tensor) -> Tensor:
-    """The parameters `[C, 5]` from standardised values `[C, M]` that stand for `number [C, M]` durations each."""
+def _two_normal(
+    sets: Sets, value: Tensor, number: Tensor, longer: Tensor, longer_number: Tensor, center: Tensor, spread: Tensor
+) -> Tensor:
+    """The parameters `[C, 5]` from standardised values `[C, M]` that stand for `number [C, M]` durations each.
+
+    `longer` and `longer_number` are likewise of those that were cut off.
+    """
     center, spread = center[:, None], spread[:, None]
     powers = torch.stack([torch.ones_like(value), value, value.square()], -1)
     share = value.new_full((len(value), 2), 0.5)
     spreads, means = share, value.new_tensor([-1.0, 1.0]).expand(len(value), 2)
-    for _ in range(EM_STEPS):
+    for _ in range(CUT_OFF_STEPS if longer.shape[1] else EM_STEPS):
         # The logarithm of how much likelier a value is in the first part is a polynomial of the value.
         narrow = spreads.square().reciprocal()
         terms = [share.log() - spreads.log() - narrow * means.square() / 2, narrow * means, -narrow / 2]
         odds = (powers @ torch.stack(terms, 1).diff(dim=2).neg())[..., 0]
         parts = torch.stack([odds.sigmoid(), odds.neg().sigmoid()], 1) * number[:, None]
         total, first, second = (parts @ powers).unbind(-1)
+        if longer.shape[1]:
+            above, *moments = _longer_moments(longer[:, None], means[..., None], spreads[..., None])
+            parts = (above + share.log()[..., None]).softmax(1) * longer_number[:, None]
+            total = total + parts.sum(-1)
+            first, second = (
+                so_far + (parts * one).sum(-1) for so_far, one in zip((first, second), moments, strict=True)
+            )
         share = (total / total.sum(-1, keepdim=True)).clamp(0.01, 0.99)
         means = first / total.clamp(min=1e-9)
         # A part that shrinks to a few durations would be infinitely likely.
@@ -169,19 +251,18 @@ def _two_normal(sets: Sets, value: Tensor, number: Tensor, center: Tensor, sprea
     return torch.stack([share[:, 0] / share.sum(-1), means[:, 0], spreads[:, 0], means[:, 1], spreads[:, 1]], -1)
 
 
-def _condensed(values: Tensor, sets: Sets) -> tuple[Tensor, Tensor]:
+def _condensed(values: Tensor, cell: Tensor, sets: int) -> tuple[Tensor, Tensor]:
     """At most `MOST_VALUES` means `[C, M]` of neighbours in each set, and how many values each is of; 0: of none."""
     order = values.argsort()
-    order = order[sets.cell[order].argsort(stable=True)]
-    cell = sets.cell[order]
-    size = cell.bincount(minlength=sets.number)
+    order = order[cell[order].argsort(stable=True)]
+    cell = cell[order]
+    size = cell.bincount(minlength=sets)
     most = min(int(size.max()), MOST_VALUES) if len(size) else 0
     rank = torch.arange(len(cell), device=cell.device) - (size.cumsum(0) - size)[cell]
     place = cell * most + rank * size.clamp(max=MOST_VALUES)[cell] // size[cell]
-    weight = torch.ones_like(values) if sets.weight is None else sets.weight[order]
-    number = values.new_zeros(sets.number * most).index_add_(0, place, weight)
-    sums = torch.zeros_like(number).index_add_(0, place, weight * values[order])
-    return (sums / number.clamp(min=1e-12)).view(sets.number, most), number.view(sets.number, most)
+    number = values.new_zeros(sets * most).index_add_(0, place, torch.ones_like(values))
+    sums = torch.zeros_like(number).index_add_(0, place, values[order])
+    return (sums / number.clamp(min=1)).view(sets, most), number.view(sets, most)
 
 
 def _normal(value: Tensor, mean: Tensor, spread: Tensor) -> Tensor:
@@ -266,39 +347,15 @@ LAWS: dict[LawName, Law] = {
 """By name, those with fewer parameters first."""
 
 
-def fit_laws(sets: Sets, laws: Sequence[LawName], cut_off: Tensor) -> Tensor:
+def fit_laws(sets: Sets, laws: Sequence[LawName]) -> Tensor:
     """`[K, C, MOST_PARAMETERS]`: the parameters of K laws in each set; those of an empty set are NaN.
 
     Args:
         sets: of durations.
         laws: names of K laws.
-        cut_off: bool `[n]`: the durations that are only known to be at least so long.
     """
-    fits = [_fit_cut_off(LAWS[law], sets, cut_off) if bool(cut_off.any()) else LAWS[law].fit(sets) for law in laws]
+    fits = [LAWS[law].fit(sets) for law in laws]
     return torch.stack([functional.pad(own, (0, MOST_PARAMETERS - own.shape[-1])) for own in fits])
-
-
-def _fit_cut_off(law: Law, sets: Sets, cut_off: Tensor) -> Tensor:
-    """The maximum of the likelihood of durations, and of the survival of those that were cut off, `[C, K]`.
-
-    Expectation maximisation (Dempster, Laird and Rubin 1977): each of the latter stands for `NODES` longer ones of the
-    law so far, those of Gauss and Laguerre, by which the mean of an exponential law is exact.
-    """
-    nodes, weights = (torch.from_numpy(values) for values in np.polynomial.laguerre.laggauss(NODES))
-    least, cell = sets.log[cut_off].exp()[:, None], sets.cell[cut_off]
-    cells = torch.cat([sets.cell[~cut_off], cell.repeat_interleave(NODES)])
-    weight = torch.cat([torch.ones_like(sets.log[~cut_off]), weights.repeat(len(cell))])
-    fit = law.fit(sets)
-    for _ in range(CUT_OFF_STEPS):
-        of = fit[cell][:, None].expand(-1, NODES, -1)
-        number = 1 - (1 - law.cdf(least.expand(-1, NODES), of)) * (-nodes).exp()
-        times = law.quantile(number.clamp(max=1 - 2.0**-53), of).maximum(least)
-        values = torch.cat([sets.log[~cut_off], times.log().flatten()])
-        longer = Sets(values, cells, sets.number, sets.resolution, weight)
-        before, fit = fit, law.fit(longer)
-        if not bool(((fit - before).abs() > CONVERGED_CUT_OFF * fit.abs()).any()):
-            break
-    return fit
 
 
 def log_likelihood(law: Law, time: Tensor, cut_off: Tensor, parameters: Tensor) -> Tensor:
