@@ -69,16 +69,13 @@ class FrontierPlanner(PriorPlanner):
         self.noise = noise
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
-        reason = "plans that reach the same state are merged"
-        self._require_deterministic(world, reason)
+        self._require_deterministic(world, "plans that reach the same state are merged")
         planner, generator = self._prepare(world, state, generator)
         widths = self._widths(world.num_actions)
         steps = sum(widths)
         chunks = self.chunks(state, steps)
         with self._threads_for(max(map(len, chunks)) * max(widths)):
-            decision = join_decisions((planner._plan(world, some, generator, steps) for some in chunks), len(state))
-        self._require_deterministic(world, reason)
-        return decision
+            return join_decisions((planner._plan(world, some, generator, steps) for some in chunks), len(state))
 
     def _widths(self, actions: int) -> list[int]:
         """How many continuations are tried at each step."""

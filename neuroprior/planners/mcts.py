@@ -69,8 +69,7 @@ class MCTSPlanner(PriorPlanner):
         self.exploration = exploration
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
-        reason = "a node of the tree is one state"
-        self._require_deterministic(world, reason)
+        self._require_deterministic(world, "a node of the tree is one state")
         planner, generator = self._prepare(world, state, generator)
         from neuroprior.planners import compiled_mcts
 
@@ -79,9 +78,7 @@ class MCTSPlanner(PriorPlanner):
         if not whole:
             numbers = max(numbers, self._state_size(world, state) // PER_ACTION)
         chunks = self.chunks(state, self.num_plans * self.length * numbers)
-        decision = join_decisions((planner._plan(whole, world, some, generator) for some in chunks), len(state))
-        self._require_deterministic(world, reason)
-        return decision
+        return join_decisions((planner._plan(whole, world, some, generator) for some in chunks), len(state))
 
     @torch.no_grad()
     def _state_size(self, world: World, state: Tensor) -> int:

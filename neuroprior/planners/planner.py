@@ -240,7 +240,7 @@ class PriorPlanner(Planner):
         return nullcontext() if self.value is not None else Stepper(self.prior).threads_for(num_plans)
 
     def _require_deterministic(self, world: World, reason: str) -> None:
-        """Raise ValueError in a stochastic world; after planning as well, which may have met a simulator's noise."""
+        """Raise ValueError in a stochastic world."""
         if world.stochastic:
             raise ValueError(f"`world` must be deterministic: {reason}")
 

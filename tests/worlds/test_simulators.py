@@ -2,6 +2,7 @@
 
 import copy
 import random
+import warnings
 
 import gymnasium
 import numpy as np
@@ -134,32 +135,90 @@ def test_rare_noise_is_noticed_by_what_is_drawn():
     assert from_simulator(Vain(), 2, stochastic=True).stochastic
 
 
-@pytest.mark.parametrize("draw", [random, np.random.default_rng(3)], ids=["module", "generator"])
-def test_noise_that_no_walk_met_is_noticed_when_it_is_met(draw):
-    class Far(simulators.Walk):
-        """Slips from 50 on."""
+class Late(simulators.Walk):
+    """Counts its steps, and from 150 on draws a number; `effect` says whether it counts."""
 
-        def __init__(self):
-            super().__init__()
-            self.draw = draw
+    def __init__(self, draw, effect=True):
+        self.draw, self.effect, self.time = draw, effect, 0
 
-        def step(self, action):
-            self.place += -1 if self.place >= 50 and self.draw.random() < 0.3 else 2 * action - 1
-            return None, float(self.place), self.place == 52
+    def step(self, action):
+        self.time += 1
+        number = self.draw.random() if self.time > 150 else 0.0
+        return None, action + (number if self.effect else 0.0), False
 
-    world, plans = from_simulator(Far(), 2), torch.ones(1, 4000, 52, dtype=torch.long)
+
+class LateClone(Late):
+    def clone(self):
+        other = copy.copy(self)
+        other.draw = self.draw if self.draw is random else copy.deepcopy(self.draw)
+        return other
+
+
+class LateDraws(Late):
+    """Draws at each step, but only late ones count."""
+
+    def step(self, action):
+        self.draw.random()
+        return super().step(action)
+
+
+def draw_of(name):
+    """What draws numbers below 1."""
+    return {
+        "generator": np.random.default_rng(3),
+        "random": random.Random(3),
+        "module random": random,
+        "module numpy.random": np.random,
+    }[name]
+
+
+NOISY = [(Late, "generator"), (Late, "module random"), (Late, "module numpy.random"), (LateClone, "random")]
+NOISY += [(LateClone, "module random"), (LateDraws, "generator"), (LateDraws, "module numpy.random")]
+
+
+@pytest.mark.parametrize("planner", [SamplingPlanner, FrontierPlanner, MCTSPlanner])
+@pytest.mark.parametrize(("kind", "name"), NOISY)
+def test_noise_that_no_walk_met_is_refused_when_plans_meet_it(kind, name, planner):
+    world = from_simulator(kind(draw_of(name)), 2)
     assert not world.stochastic
-    world.rollout(world.reset(1), plans[:, :1])
-    assert world.stochastic
-    world = from_simulator(Far(), 2)
-    near = world.rollout(world.reset(1), plans[:, :1, :50]).final_state[:, 0]
+    near = planner(UniformPrior(2), 140, 4).plan(world, world.reset(1), seeded(0))
+    assert float(near.score) > 0
+    for _ in range(2):
+        with refuses("plans met noise that no trial walk had met; give `stochastic=True`"):
+            planner(UniformPrior(2), 160, 4).plan(world, world.reset(1), seeded(0))
+    allowed = from_simulator(kind(draw_of(name)), 2, stochastic=True)
+    assert allowed.stochastic
+
+
+@pytest.mark.parametrize("kind", [Late, LateClone, LateDraws])
+@pytest.mark.parametrize("name", ["generator", "module random"])
+def test_numbers_that_are_drawn_late_to_no_effect_are_no_noise(kind, name):
+    world = from_simulator(kind(draw_of(name), effect=False), 2)
+    plans = torch.randint(2, (1, 20, 160), generator=seeded(0))
+    for _ in range(3):
+        assert world.rollout(world.reset(1), plans).rewards.equal(plans.double())
+        _, reward = world.step(world.rollout(world.reset(1), plans).final_state[0], plans[0, :, 0].long())
+        assert reward.equal(plans[0, :, 0].double())
     assert not world.stochastic
-    reached, again = (world.rollout(near, plans[:, :, :2], seeded(0)) for _ in range(2))
-    assert world.stochastic
-    assert reached.rewards.equal(again.rewards)
-    assert reached.final_state.equal(again.final_state)
-    share = float((reached.rewards[..., -1] == 52).double().mean())
-    assert abs(share - 0.49) < SIGMAS * (0.49 * 0.51 / 4000) ** 0.5
+
+
+def test_noise_that_no_walk_met_is_noticed_in_other_processes():
+    pytest.importorskip("joblib")
+    world = from_simulator(Late(draw_of("module random")), 2, workers=2)
+    with refuses("give `stochastic=True`"):
+        world.rollout(world.reset(1), torch.ones(1, 4, 160, dtype=torch.long))
+
+
+def test_noise_that_is_declared_away_is_a_warning():
+    with pytest.warns(UserWarning, match="`stochastic` must be None or True") as caught:
+        world = from_simulator(simulators.Slip(random.Random(0)), 2, stochastic=False)
+    assert caught[0].filename == __file__
+    plans = torch.ones(1, 4, 6, dtype=torch.long)
+    first, second = (world.rollout(world.reset(1), plans, seeded(seed)).rewards for seed in (0, 1))
+    assert first.equal(second)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        from_simulator(simulators.Walk(), 2, stochastic=False)
 
 
 def test_the_simulator_and_the_callers_generators_stay_as_they_were():
@@ -481,20 +540,3 @@ def test_copies_that_lose_what_a_simulator_is_are_not_used():
     world = from_simulator(simulators.Views, 2)
     rewards = world.rollout(world.reset(1), torch.tensor([[[1, 1, 1, 0]]])).rewards
     assert rewards.flatten().tolist() == [0.5, 0.5, 0.5, 7.0]
-
-
-@pytest.mark.parametrize("kind", [FrontierPlanner, MCTSPlanner])
-def test_noise_that_is_met_while_planning_is_refused_by_planners_without_noise(kind):
-    class Late:
-        def __init__(self):
-            self.generator, self.time = np.random.default_rng(0), 0
-
-        def step(self, action):
-            self.time += 1
-            return None, 10.0 * (self.generator.random() < 0.5) * action if self.time > 130 else 0.0, False
-
-    world = from_simulator(Late(), 2)
-    assert not world.stochastic
-    with refuses("must be deterministic"):
-        kind(UniformPrior(2), 140, 4).plan(world, world.reset(1), seeded(0))
-    assert world.stochastic

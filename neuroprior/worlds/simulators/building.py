@@ -6,7 +6,7 @@ from functools import partial
 from operator import methodcaller
 from typing import Any, Literal
 
-from neuroprior._checks import check_sizes, kind_of
+from neuroprior._checks import check_sizes, kind_of, warn_caller
 from neuroprior.worlds.observations import Categories, Features
 from neuroprior.worlds.simulators.copies import (
     CloneCopier,
@@ -22,6 +22,11 @@ from neuroprior.worlds.simulators.generators import keep_global_generators, seed
 from neuroprior.worlds.simulators.trials import Noise, require_as_original, require_same_starts, try_out
 from neuroprior.worlds.simulators.world import SimulatorWorld, enter, make_start
 from neuroprior.worlds.world import check_objective
+
+NOISE_SHOWS = (
+    "`stochastic` must be None or True where other random numbers change what happens, got False: every plan is tried"
+    " under the same noise, which planners foresee"
+)
 
 
 def from_simulator(
@@ -52,7 +57,7 @@ def from_simulator(
     Copies are tried out: on random walks they must behave as the simulator does. Where other random numbers change
     what happens, the world is stochastic. Then each candidate plan meets noise of its own, drawn by the generator that
     a planner is given. Noise must come from generators that the simulator holds (of numpy, `random` or torch, however
-    deep), or from the modules' own.
+    deep), or from the modules' own. Noise that no walk met is a ValueError when plans meet it.
 
     Args:
         simulator: an object, a list of them (several starts), or a function without arguments that makes one. Of a
@@ -66,7 +71,8 @@ def from_simulator(
         observe: a function from a simulator to what is observed, or "observation": what `step` returned last.
         observation: what `observe` returns, `Categories(number)` or `Features(size)`.
         objective, discount: what counts in this world; see `Planner`.
-        stochastic: whether the same actions may lead to something else; None: this is tried out.
+        stochastic: whether the same actions may lead to something else; None: this is tried out. False: every plan is
+            tried under the same noise.
         seeds: of a function: starts are made by these, and drawn with equal probability; None: each is a new one.
         workers: so many processes share the plans of a start; worth it for steps of milliseconds. None: this process.
         action_names: A names.
@@ -75,6 +81,9 @@ def from_simulator(
     Raises:
         ValueError: the simulator cannot be copied, its copies share a state, its noise cannot be seeded, or an argument
             is wrong.
+
+    Warns:
+        UserWarning: `stochastic` is False, but other random numbers changed the walks.
 
     Example:
         >>> class Walk:
@@ -112,7 +121,7 @@ def from_simulator(
                     require_same_starts(
                         driver, copier, starts[0], make_start(driver, copier, make, (seeds or (seed,))[0])
                     )
-                noise = try_out(driver, copier, starts, seed, stochastic is None)
+                noise = try_out(driver, copier, starts, seed, not stochastic)
                 if make is not None and not noise.draws:
                     require_as_original(driver, copier, starts[0], make((seeds or (seed,))[0])[0])
             except Exception as error:  # a simulator may fail to be copied in any way of its own
@@ -120,7 +129,9 @@ def from_simulator(
                 continue
             if [fingerprint(one) for one in originals] != marks:
                 raise ValueError("`simulator` must have copies that share nothing with it: stepping one changed it")
-            noise = noise if stochastic is None else Noise(stochastic, True)
+            if noise.stochastic and stochastic is False:
+                warn_caller(NOISE_SHOWS)
+            noise = noise if stochastic is None else Noise(stochastic, True, declared=True)
             kept = starts if make is None or seeds is not None else []
             world = SimulatorWorld(driver, copier, noise, make, kept, workers)
             world.objective, world.discount = objective, discount

@@ -55,6 +55,10 @@ class Copier(ABC):
         """The generators that all copies share."""
         return []
 
+    def separate_generators(self, simulator: Any) -> list[Any]:
+        """The generators of a simulator that `load` returned which no other copy shares."""
+        return self.generators(simulator)
+
     def text(self, saved: Any) -> bytes:
         """Bytes that are the same only where all that was saved is the same; empty where there are none."""
         return b""
@@ -82,6 +86,9 @@ class _SharingCopier(Copier):
 
     def shared_generators(self) -> list[Any]:
         return [value for value in self._shared.values() if isinstance(value, GENERATORS)]
+
+    def separate_generators(self, simulator: Any) -> list[Any]:
+        return []
 
     def _share(self, simulator: Any) -> dict[int, Path]:
         """The paths of what copies share by the addresses of the same in a new simulator: generators, and modules."""

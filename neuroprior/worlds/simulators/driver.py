@@ -8,7 +8,13 @@ import numpy as np
 
 from neuroprior.worlds.observations import Categories, Features
 from neuroprior.worlds.simulators.copies import Copier
-from neuroprior.worlds.simulators.generators import create_lazy_generators, find_generators, seed_generators
+from neuroprior.worlds.simulators.generators import (
+    create_lazy_generators,
+    find_generators,
+    seed_generators,
+    state_of_generators,
+    state_of_held,
+)
 
 Array = np.ndarray[Any, Any]
 
@@ -253,12 +259,16 @@ def make_simulator(factory: Callable[[], Any], seed: int) -> tuple[Any, Any, Any
 
 def follow_plans(
     driver: Driver, copier: Copier, saved: Any, view: View | None, plans: list[list[int]], seeds: list[int | None]
-) -> list[Path]:
-    """The paths of plans from one state, each under the noise of its seed (None: it is not seeded)."""
-    paths = []
+) -> tuple[list[Path], bool]:
+    """The paths of plans from one state, each under the noise of its seed, and whether one without a seed drew."""
+    paths, held, draws = list[Path](), None, False
+    shared = state_of_generators(copier.shared_generators()) if None in seeds else None
     for plan, seed in zip(plans, seeds, strict=True):
         simulator = copier.load(saved)
         if seed is not None:
             seed_generators(copier.generators(simulator), seed)
+        elif held is None:  # the same in all copies
+            held = state_of_held(copier.separate_generators(simulator))
         paths.append(driver.follow(simulator, plan, view))
-    return paths
+        draws = draws or (seed is None and held != state_of_held(copier.separate_generators(simulator)))
+    return paths, draws or (shared is not None and shared != state_of_generators(copier.shared_generators()))

@@ -38,7 +38,13 @@ def seed_generators(generators: Iterable[Any], seed: int) -> None:
 def state_of_generators(generators: Iterable[Any]) -> list[Any]:
     """The states of generators, and of those of the modules, to be compared."""
     numpy_state = np.random.get_state(legacy=False)  # noqa: NPY002
-    states: list[Any] = [random.getstate(), _comparable(numpy_state), torch.get_rng_state().numpy().tobytes()]
+    states = [random.getstate(), _comparable(numpy_state), torch.get_rng_state().numpy().tobytes()]
+    return states + state_of_held(generators)
+
+
+def state_of_held(generators: Iterable[Any]) -> list[Any]:
+    """The states of generators alone, to be compared."""
+    states: list[Any] = []
     for generator in generators:
         if isinstance(generator, np.random.Generator):
             states.append(_comparable(generator.bit_generator.state))

@@ -27,10 +27,11 @@ class Start(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """Whether a simulator is stochastic, and whether it draws from any generator."""
+    """Whether a simulator is stochastic, whether it draws from any generator, and whether a user declared it."""
 
     stochastic: bool
     draws: bool
+    declared: bool = False
 
 
 class Moment(NamedTuple):
@@ -109,6 +110,12 @@ def require_as_original(driver: Driver, copier: Copier, start: Start, original: 
     moments, _ = random_walk(driver, copier.load(start.saved), start.view, WALK_LENGTH, np.random.default_rng(0))
     whole, _ = follow_on(driver, original, start.view, _actions(moments))
     _require_equal(moments, whole, "have copies that behave as it does")
+
+
+def changes_by_noise(driver: Driver, copier: Copier, start: Start, actions: Sequence[int], seed: int) -> bool:
+    """Whether actions give something else under the noise of `seed` than under that of 0."""
+    first, second = (_follow(driver, copier, *start, actions, one) for one in (0, seed))
+    return first != second
 
 
 def _actions(moments: Sequence[Moment]) -> list[int]:

@@ -1,5 +1,6 @@
 """Simulators as worlds: a planner tries plans in copies of them."""
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, Self, TypeVar
 
@@ -16,16 +17,20 @@ from neuroprior.worlds.simulators.generators import (
     keep_global_generators,
     seed_generators,
     state_of_generators,
+    state_of_held,
 )
 from neuroprior.worlds.simulators.readers import Reader, find_reader
 from neuroprior.worlds.simulators.store import Recent, Store
-from neuroprior.worlds.simulators.trials import Noise, Start
+from neuroprior.worlds.simulators.trials import Noise, Start, changes_by_noise
 from neuroprior.worlds.world import Rollout, World, check_plans, on_cpu
 
-Result = TypeVar("Result")
+Result = TypeVar("Result", bound=tuple[Any, ...])
 
 MAX_SNAPSHOTS, MAX_VIEWS = 2048, 2**15
 """Copies of simulators that are kept, and views (observations and legal actions) of states."""
+
+MIN_COMPARED, COMPARED_EVERY = 64, 32
+"""Comparisons under other random numbers, at least, where plans draw some for the first time; later of so many, one."""
 
 
 class SimulatorWorld(World):
@@ -38,7 +43,8 @@ class SimulatorWorld(World):
     Args:
         driver: steps the simulators.
         copier: copies them.
-        noise: whether they are stochastic, and draw random numbers at all.
+        noise: whether they are stochastic, and draw random numbers at all. Unless that is declared, plans that show
+            noise in a deterministic world are a ValueError.
         make: a function from a seed to a simulator at the start of an episode; None: there are only `starts`.
         starts: where episodes begin; none: `make` makes new ones.
         workers: processes that share the plans of a rollout.
@@ -67,6 +73,8 @@ class SimulatorWorld(World):
         self.stochastic, self.all_legal = noise.stochastic, not driver.has_masks
         self.objective, self.discount = "return", 1.0
         self.driver, self.copier, self._draws, self._make = driver, copier, noise.draws, make
+        self._watched, self._drew = not (noise.stochastic or noise.declared), False
+        self._other_seeds = itertools.count(1)
         self._workers, self.prepare = workers, None
         self._store = Store(self.num_actions, not self.stochastic)
         self._reader: Reader | None = None
@@ -133,14 +141,16 @@ class SimulatorWorld(World):
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         """See `World.step`. An action that is not legal changes nothing, with a reward of 0."""
         generator = generator_on(generator, "cpu")
-        return self._run(lambda: self._step(state, action, generator))
+        return self._run(lambda: self._step(state, action, generator), state, action[:, None, None])
 
     def _step(self, state: Tensor, action: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         seeds = self._draw_seeds((len(state),), generator).tolist()
         after, rewards = state.tolist(), [0.0] * len(state)
+        shared = None if self._draws else state_of_generators(self.copier.shared_generators())
         for row, (start, one, seed) in enumerate(zip(state.tolist(), action.tolist(), seeds, strict=True)):
             if not self._is_over(start):
                 after[row], rewards[row] = self._take(start, one, seed)
+        self._drew |= not self._draws and shared != state_of_generators(self.copier.shared_generators())
         return torch.tensor(after, dtype=torch.long), torch.tensor(rewards, dtype=torch.float64)
 
     def rollout(
@@ -153,7 +163,7 @@ class SimulatorWorld(World):
         self.check_state(state)
         check_plans(plans, len(state), self.num_actions)
         generator = generator_on(generator, "cpu")
-        return self._run(lambda: self._rollout(state, plans, generator, keep_states))
+        return self._run(lambda: self._rollout(state, plans, generator, keep_states), state, plans)
 
     def _rollout(self, state: Tensor, plans: Tensor, generator: torch.Generator, keep_states: bool) -> Rollout:
         batch, num_plans, length = plans.shape
@@ -215,18 +225,42 @@ class SimulatorWorld(World):
             raise ValueError("`state` must be int64 of shape [B], such as reset and state_of return")
         check_range("state", state, len(self._store), "states so far")
 
-    def _run(self, work: Callable[[], Result]) -> Result:
-        """What `work` returns; where it draws random numbers, as no walk did, the world becomes stochastic."""
+    def _run(self, work: Callable[[], Result], state: Tensor, plans: Tensor) -> Result:
+        """What `work` returns, which follows `plans [B, P, L]`; refuses noise in a deterministic world."""
         with keep_global_generators():
-            if self._draws:
-                return work()
-            held = self.copier.shared_generators()
-            before = state_of_generators(held)
+            self._drew = False
             result = work()
-            if state_of_generators(held) == before:
-                return result
-            self.stochastic, self._draws, self._store.deterministic = True, True, False
-            return work()
+            if self._watched and (self._draws or self._drew):
+                self._require_no_noise(state, plans, result[1])
+                self._draws = True
+            return result
+
+    def _require_no_noise(self, state: Tensor, plans: Tensor, rewards: Tensor) -> None:
+        """Raise ValueError where plans that draw random numbers lead elsewhere by others.
+
+        Args:
+            state: `[B]`.
+            plans: `[B, P, L]`. All are compared if they are the first to draw, else the best and some others.
+            rewards: of their steps, `[B, P, L]` or, of single steps, `[B]`.
+        """
+        if not plans.numel():
+            return
+        starts, each = state.repeat_interleave(plans.shape[1]).tolist(), plans.flatten(0, 1).tolist()
+        tried = [(start, *plan) for start, plan in zip(starts, each, strict=True)]
+        if self._draws:
+            gains = rewards.reshape(len(tried), -1)
+            best = int((gains[:, -1] if self.objective == "terminal" else gains.sum(1)).argmax())
+            tried = [tried[best], *tried[next(self._other_seeds) % COMPARED_EVERY :: COMPARED_EVERY]]
+        tried = [(start, *plan) for start, *plan in dict.fromkeys(tried) if not self._is_over(start)]
+        for _ in range(1 if self._draws else -(-MIN_COMPARED // max(len(tried), 1))):
+            seed = next(self._other_seeds)
+            for start, *plan in tried:
+                where = Start(self._snapshot(start), View(None, None) if self.all_legal else self._view(start))
+                if changes_by_noise(self.driver, self.copier, where, plan, seed):
+                    raise ValueError(
+                        "`stochastic` must be True for this simulator: plans met noise that no trial walk had met;"
+                        " give `stochastic=True`"
+                    )
 
     def _draw_seeds(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
         """A seed for each plan; all 0 in a deterministic world."""
@@ -249,7 +283,9 @@ class SimulatorWorld(World):
                 return start, 0.0
             simulator = self._load(start)
             self._seed(simulator, seed)
+            held = None if self._draws else state_of_held(self.copier.separate_generators(simulator))
             path = self.driver.follow(simulator, [action], View(None, None))
+            self._drew |= held is not None and held != state_of_held(self.copier.separate_generators(simulator))
             handle = self._store.add(start, [action], seed, path.rewards[0], path.ended)
             self._views.put(handle, path.views[0])
             self._keep(handle, simulator, (start, [action], seed))
@@ -262,7 +298,9 @@ class SimulatorWorld(World):
         view = self._view(start) if wanted else None
         snapshot = self._snapshot(start)
         if self._workers is None or isinstance(self.copier, ReplayCopier):
-            return follow_plans(self.driver, self.copier, snapshot, view, plans, seeds)
+            paths, draws = follow_plans(self.driver, self.copier, snapshot, view, plans, seeds)
+            self._drew |= draws
+            return paths
         from joblib import Parallel, delayed
 
         parts = [slice(n, None, self._workers) for n in range(self._workers)]
@@ -270,9 +308,10 @@ class SimulatorWorld(World):
         shared = Parallel(self._workers)(
             delayed(follow_plans)(self.driver, copier, sent, view, plans[part], seeds[part]) for part in parts
         )
-        paths: list[Path] = [None] * len(keys)  # type: ignore[list-item]
-        for part, found in zip(parts, shared, strict=True):
-            paths[part] = found
+        paths = [None] * len(keys)  # type: ignore[list-item]
+        for part, (some, draws) in zip(parts, shared, strict=True):
+            paths[part] = some
+            self._drew |= draws
         return paths
 
     def _number_path(self, start: int, path: Path, seed: int, length: int) -> list[int]:
