@@ -10,6 +10,7 @@ import torch
 from scipy import stats
 
 from neuroprior.behaviour import DurationModel, RecordedPlans, Recordings, duration_survival
+from neuroprior.behaviour.durations.laws import LAWS, Sets, fit_laws
 from neuroprior.behaviour.durations.survival import survival_curve
 from neuroprior.behaviour.reporting.durations import duration_section
 from neuroprior.behaviour.reporting.scores import evaluate_saved
@@ -289,3 +290,18 @@ def test_of_three_conditions_there_are_medians():
     finding = next(one for one in part.findings if one.id == "survival: rest")
     assert finding.effect is None
     assert finding.sentence.startswith("How long a bout of rest lasts differs between conditions: medians")
+
+
+def test_what_was_cut_off_in_one_set_changes_no_other():
+    """Of three sets one has durations that were cut off; all laws of the others are those without it, and finite."""
+    generator = seeded(11)
+    time = torch.cat([torch.rand(number, generator=generator).double() + 0.1 for number in (30, 45, 60)])
+    cell = torch.arange(3).repeat_interleave(torch.tensor([30, 45, 60]))
+    cut_off = (cell == 1) & (torch.rand(135, generator=generator) < 0.1)
+    assert 0 < cut_off.sum() < 9
+    names = list(LAWS)
+    fits = fit_laws(Sets(time.log(), cell, 3, 0.0, cut_off), names)
+    plain = fit_laws(Sets(time.log(), cell, 3, 0.0, torch.zeros_like(cut_off)), names)
+    assert fits.isfinite().all()
+    assert fits[:, [0, 2]].allclose(plain[:, [0, 2]], rtol=1e-4)
+    assert (fits[0, 1, 0] > plain[0, 1, 0]).item()  # the mean of an exponential law
