@@ -309,7 +309,7 @@ def test_what_was_cut_off_in_one_set_changes_no_other():
 
 
 def test_laws_of_actions_that_are_seldom_cut_off_are_finite():
-    """The last bout of each plan is cut off, of some actions none is; each action has the law that it was drawn from."""
+    """The last bout of each plan is cut off, of some actions none is; each has the law that it was drawn from."""
     generator = seeded(12)
     actions = torch.randint(4, (40, 70), generator=generator)
     actions[:, -1] = torch.arange(40) % 2
