@@ -42,6 +42,8 @@ class Settings:
         check_every: steps between two validations (on the held-out plans). None: two passes through the plans, but at
             least 10 and at most 100, so that small data sets are not overfitted before the first.
         patience: steps without a lower validation loss after which training stops. None: .3 of all steps.
+        seconds: after which training stops, at the next validation. None: no limit. The combined prior trains networks
+            one after the other while there is time, which differs from machine to machine, as does what is learned.
         progress: show it: a bar in a terminal or a notebook, elsewhere a line now and then.
 
     Raises:
@@ -61,6 +63,7 @@ class Settings:
     validation: float | Sequences = 0.1
     check_every: int | None = None
     patience: int | None = None
+    seconds: float | None = None
     progress: bool = True
 
     def __post_init__(self) -> None:
@@ -75,6 +78,8 @@ class Settings:
             value = getattr(self, name)
             if not is_number(value) or not 0 < value < inf:
                 raise ValueError(f"`{name}` must be above 0 and finite, got {value}.")
+        if self.seconds is not None and (not is_number(self.seconds) or not 0 <= self.seconds < inf):
+            raise ValueError(f"`seconds` must be at least 0 and finite, got {self.seconds}.")
         if not is_number(self.weight_decay) or not 0 <= self.weight_decay < inf:
             raise ValueError(f"`weight_decay` must be at least 0 and finite, got {self.weight_decay}.")
         if not isinstance(self.validation, Sequences):

@@ -141,7 +141,7 @@ class Keeper(WeightAveraging):
 
     The weights themselves are as noisy as the learning rate is high, and where training is stopped early, the rate has
     not fallen far (Polyak and Juditsky 1992). After each validation it also stops a training that no longer gets
-    better, prints a line of progress now and then, and writes a checkpoint.
+    better, or whose time is up, prints a line of progress now and then, and writes a checkpoint.
 
     Args:
         device: of the training: Lightning moves the module there only after the averages are made.
@@ -163,6 +163,7 @@ class Keeper(WeightAveraging):
         super().__init__(device, use_buffers=False, multi_avg_fn=_update_averages)
         assert data.settings.patience is not None
         self.patience, self.max_steps = ceil(data.settings.patience / data.steps), data.epochs * data.steps
+        self.stop_at = inf if data.settings.seconds is None else time.monotonic() + data.settings.seconds
         self.lines, self.folder = lines, folder
         self.best_bits, self.best_weights = inf, dict[str, Tensor]()
         self.bits_to_beat, self.epochs_without = inf, 0
@@ -179,7 +180,7 @@ class Keeper(WeightAveraging):
         self.epochs_without += 1
         if bits + MIN_GAIN < self.bits_to_beat:
             self.bits_to_beat, self.epochs_without = bits, 0
-        if self.epochs_without >= self.patience or not isfinite(bits):
+        if self.epochs_without >= self.patience or not isfinite(bits) or time.monotonic() >= self.stop_at:
             trainer.should_stop = True
         if self.lines and time.monotonic() - self.last_line >= MIN_SECONDS:
             Keeper.last_line = time.monotonic()

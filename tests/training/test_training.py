@@ -1,14 +1,18 @@
 """Training: the loss, what is validated and kept, early stopping, checkpoints, given validation plans, interruption."""
 
+import itertools
 import math
 import time
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from neuroprior import GRUPrior, Plans, TransformerPrior
 from neuroprior.priors import StackedPrior
-from neuroprior.training import PlansModule, PriorModule, Settings, train
+from neuroprior.priors.ensembles import candidates
+from neuroprior.priors.neural.neural import NeuralPrior
+from neuroprior.training import PlansModule, PriorModule, Settings, train, trainer
 from neuroprior.training.batches import MAX_DISTINCT
 from tests.support.sources import refuses, seeded
 
@@ -51,7 +55,9 @@ def test_plans_of_other_lengths_are_not_merged():
     assert sorted(batch.weight.sum(1).tolist()) == [1 * 34, 2 * 33, 3 * 33]
 
 
-@pytest.mark.parametrize(("setting", "value"), [("max_steps", 0), ("window", 2.5), ("learning_rate", math.inf)])
+@pytest.mark.parametrize(
+    ("setting", "value"), [("max_steps", 0), ("window", 2.5), ("learning_rate", math.inf), ("seconds", -1)]
+)
 def test_bad_settings(setting, value):
     with refuses(f"`{setting}` must be", f"got {value}."):
         Settings(**{setting: value})
@@ -141,6 +147,36 @@ def test_patience_is_counted_in_steps():
     """Hardly anything is learned at so low a rate: after the first validation two more, ten steps each, are awaited."""
     curve = train(GRUPrior(3, 4), drawn(), how(100, learning_rate=1e-9, check_every=10, patience=20), 0)
     assert [entry["step"] for entry in curve] == [10, 20, 30]
+
+
+def test_when_time_is_up_training_stops_at_the_next_validation(monkeypatch):
+    """On a clock that goes on by a second with each look, which the trainer takes at each validation."""
+    clock = itertools.count()
+    monkeypatch.setattr(trainer, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    curve = train(GRUPrior(3, 4), drawn(), how(100, check_every=10, patience=1000, seconds=2.5), 0)
+    assert [entry["step"] for entry in curve] == [10, 20, 30]
+    monkeypatch.undo()
+    curve = train(GRUPrior(3, 4), drawn(), how(100, check_every=10, seconds=0), 0)
+    assert [entry["step"] for entry in curve] == [10]
+
+
+def test_the_combined_prior_counts_first_and_trains_while_there_is_time(monkeypatch):
+    """Of 50 seconds the first of three networks may take a third; it takes 30, the next one 20, and none is left."""
+    plans, now, given = Plans(drawn(60, 9).actions, 3), [0.0], []
+
+    def fit(prior, plans, *, seconds, **settings):
+        given.append(seconds)
+        now[0] += 30 if len(given) == 1 else 20
+        return NeuralPrior.fit(prior, plans, max_steps=2, progress=False, validation=settings["validation"])
+
+    monkeypatch.setattr(candidates, "monotonic", lambda: now[0])
+    monkeypatch.setattr(GRUPrior, "fit", fit)
+    monkeypatch.setattr(candidates, "networks", lambda *_: [GRUPrior(3, 4), GRUPrior(3, 4), GRUPrior(3, 4)])
+    settings = {"seconds": 50.0}
+    made = list(candidates.fitted_experts(plans, plans[:10], {}, "full", seeded(0), settings))
+    assert given == [50 / 3, 10]
+    assert sum(isinstance(prior, GRUPrior) for prior in made) == 2
+    assert settings == {"seconds": 50.0}
 
 
 def test_small_gains_are_worth_going_on_for():

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from math import inf
+from time import monotonic
 from typing import Any, Literal
 
 import torch
@@ -76,10 +77,18 @@ def fitted_experts(
         contexts: `num_contexts` or `context_size`, as experts take it that can, or none.
         effort: which networks are trained.
         generator: draws their initial weights and the order of training.
-        settings: of their training.
+        settings: of their training. Networks share the `seconds` that are left when all has been counted, if these are
+            limited; those for which nothing is left are not trained.
     """
+    begun, seconds = monotonic(), settings.get("seconds")
     yield from counted(learned, held_out, contexts)
-    for prior in networks(learned.num_actions, contexts, effort, draw_seed(generator) % 2**31):
+    made = networks(learned.num_actions, contexts, effort, draw_seed(generator) % 2**31)
+    for number, prior in enumerate(made):
+        if seconds is not None:
+            left = (seconds - (monotonic() - begun)) / (len(made) - number)
+            if left <= 0:
+                return
+            settings = {**settings, "seconds": left}
         yield prior.fit(plans_for(prior, learned), generator=generator, **{"validation": held_out, **settings})
 
 
