@@ -23,7 +23,7 @@ from neuroprior.comparison.contestants import (
 )
 from neuroprior.comparison.pacing import MIN_SEEDS, PLANNING_SHARE, Progress, fit_starts, seconds_per_step
 from neuroprior.comparison.results import Comparison
-from neuroprior.comparison.trial import MIN_LEARNED, Design, Outcome, run_seed
+from neuroprior.comparison.trial import MIN_LEARNED, Design, Outcome, collector_name, run_seed
 from neuroprior.worlds import World
 from neuroprior.worlds.world import check_is_world
 
@@ -199,8 +199,12 @@ def _processes(design: Design, seconds: float, jobs: int) -> tuple[int, list[str
 
 def _fit(design: Design, seconds: float, starts: int | None, training_starts: int | None) -> tuple[Design, list[str]]:
     """The design with as many starts as there is time for, of those that were not asked for, and a note if fewer."""
-    each = seconds_per_step(design.held_out or design.world, design.length)
-    cut = fit_starts(design, each, seconds * PLANNING_SHARE / MIN_SEEDS)
+    collector = collector_name(design.world)
+    training = seconds_per_step(design.world, design.length, collector)
+    planners = [collector if name == collector else "sampling" for name in design.planners]
+    rates = {name: seconds_per_step(design.held_out or design.world, design.length, name) for name in set(planners)}
+    each = sum(rates[name] for name in planners) / len(planners)
+    cut = fit_starts(design, each, training, seconds * PLANNING_SHARE / MIN_SEEDS)
     cut = replace(cut, starts=starts or cut.starts, training_starts=training_starts or cut.training_starts)
     if all(getattr(cut, size) == getattr(design, size) for size in ("starts", "training_starts", "training_budget")):
         return design, []

@@ -10,7 +10,9 @@ from typing import Self
 
 import torch
 
+from neuroprior.comparison.contestants import make_planner
 from neuroprior.comparison.trial import Design
+from neuroprior.priors import UniformPrior
 from neuroprior.worlds import World
 
 MIN_SEEDS = 5
@@ -32,30 +34,31 @@ SILENT_SECONDS = 8.0
 """Seconds after which progress is printed again."""
 
 
-def seconds_per_step(world: World, length: int) -> float:
-    """Seconds that a simulator step takes, of many at once."""
+def seconds_per_step(world: World, length: int, planner: str) -> float:
+    """Seconds that a simulator step takes a planner without a prior, of many at once."""
     generator, batch = torch.Generator().manual_seed(0), 1
+    timed = make_planner(planner, UniformPrior(world.num_actions), length, TIMED_PLANS)
     while True:
         state = world.reset(batch, generator)
-        plans = torch.randint(world.num_actions, (batch, TIMED_PLANS, length), generator=generator)
         begin = time.perf_counter()
-        world.rollout(state, plans.to(state.device), generator)
+        steps = timed.plan(world, state, generator).model_steps
         seconds = time.perf_counter() - begin
         if seconds > TIMED_SECONDS or batch >= MAX_TIMED_STARTS:
-            return seconds / plans.numel()
+            return seconds / (batch * steps)
         batch *= 4
 
 
-def fit_starts(design: Design, step_seconds: float, seconds: float) -> Design:
+def fit_starts(design: Design, step_seconds: float, training_seconds: float, seconds: float) -> Design:
     """The design with as many starts, and as many plans tried in training, as there is time for.
 
     Args:
         design: with the starts that are wanted.
-        step_seconds: of a simulator step.
+        step_seconds: of a simulator step where planners are compared.
+        training_seconds: of one where training plans are collected.
         seconds: that a seed may spend on simulator steps.
     """
     training, held_out = design.model_steps
-    needed = step_seconds * (training * design.training_starts + held_out * design.starts)
+    needed = training_seconds * training * design.training_starts + step_seconds * held_out * design.starts
     if needed <= seconds:
         return design
     share, root = seconds / needed, sqrt(seconds / needed)

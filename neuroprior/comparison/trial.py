@@ -187,8 +187,7 @@ def training_plans(design: Design, state: Tensor, generator: torch.Generator) ->
     None: fewer than `MIN_LEARNED` do.
     """
     world, uniform = design.world, UniformPrior(design.world.num_actions)
-    name = "sampling" if world.stochastic else "frontier"
-    planner = make_planner(name, uniform, design.length, design.training_budget)
+    planner = make_planner(collector_name(world), uniform, design.length, design.training_budget)
     context: Literal["step"] | None = None if world.observation is None else "step"
     plans = collect(planner, world, state=state, context=context, generator=generator)
     if isinstance(world.observation, Categories):
@@ -201,11 +200,21 @@ def training_plans(design: Design, state: Tensor, generator: torch.Generator) ->
     return plans[better] if int(better.sum()) >= MIN_LEARNED else None
 
 
+def collector_name(world: World) -> str:
+    """The planner that collects training plans in a world."""
+    return "sampling" if world.stochastic else "frontier"
+
+
 def random_scores(
     world: World, state: Tensor, length: int, num_plans: int, generator: torch.Generator, score_seed: int
 ) -> Tensor:
     """The mean score `[B]`, float64, of random plans of legal actions from each of `state [B, ...]`."""
-    plans, _ = sample_in_world(UniformPrior(world.num_actions), world, state, num_plans, length, generator=generator)
+    uniform = UniformPrior(world.num_actions)
+    if world.all_legal:  # nothing of the world is needed to draw them
+        plans = uniform.sample(len(state) * num_plans, length, generator=generator)
+        plans = plans.view(len(state), num_plans, length).to(state.device)
+    else:
+        plans, _ = sample_in_world(uniform, world, state, num_plans, length, generator=generator)
     return true_scores(world, state, plans, score_seed).mean(1)
 
 

@@ -74,6 +74,8 @@ class FrontierPlanner(PriorPlanner):
         widths = self._widths(world.num_actions)
         steps = sum(widths)
         chunks = self.chunks(state, steps)
+        if world.max_snapshots is not None:  # of a chunk, those of three steps are used in turn
+            chunks = state.split(min(len(chunks[0]) or 1, max(world.max_snapshots // (3 * max(widths)), 1)))
         with self._threads_for(max(map(len, chunks)) * max(widths)):
             return join_decisions((planner._plan(world, some, generator, steps) for some in chunks), len(state))
 

@@ -66,6 +66,7 @@ class World(ABC):
             Planners without an objective of their own follow it.
         discount: above 0, at most 1: the reward of step t (from 0) counts `discount ** t` in a return.
         action_names: names of the actions, where there are any.
+        max_snapshots: how many states can be stepped from at once; others are first reached again. None: all.
     """
 
     num_actions: int
@@ -77,6 +78,7 @@ class World(ABC):
     objective: Literal["terminal", "return"] = "return"
     discount: float = 1.0
     action_names: tuple[str, ...] | None = None
+    max_snapshots: int | None = None
 
     def __init_subclass__(cls, **settings: object) -> None:
         super().__init_subclass__(**settings)

@@ -540,3 +540,15 @@ def test_copies_that_lose_what_a_simulator_is_are_not_used():
     world = from_simulator(simulators.Views, 2)
     rewards = world.rollout(world.reset(1), torch.tensor([[[1, 1, 1, 0]]])).rewards
     assert rewards.flatten().tolist() == [0.5, 0.5, 0.5, 7.0]
+
+
+def test_the_frontier_planner_reaches_no_state_twice(monkeypatch):
+    """The states of three steps of 4 starts would be more than three times as many as are kept."""
+    world, reached = from_simulator(simulators.Walk, 2), []
+    world.max_snapshots = 150
+    reach = SimulatorWorld._reach
+    monkeypatch.setattr(SimulatorWorld, "_reach", lambda self, handle: reached.append(handle) or reach(self, handle))
+    state = world.reset(4, seeded(0))
+    decision = FrontierPlanner(UniformPrior(2), 12, 32).plan(world, state, seeded(1))
+    assert decision.score.tolist() == [1, 1, 1, 1]
+    assert sorted(reached) == state.tolist()
