@@ -130,12 +130,19 @@ def test_plans_of_one_action(kind):
         torch.zeros(0, 4).long(),
         torch.zeros(9, 0).long(),
         Plans(torch.zeros(9, 4).long(), 3, lengths=torch.zeros(9).long()),
-        Plans(torch.zeros(9, 4).long(), 3, group=torch.zeros(9).long()),
     ],
 )
 def test_refuses_too_few_plans(kind, plans):
     with refuses("plans"):
         small(kind).fit(plans, **QUICK)
+
+
+@BOTH
+def test_a_single_group_is_no_group(kind):
+    """Plans of one animal are held out as if they had no group."""
+    actions = torch.randint(3, (9, 4), generator=seeded(3))
+    one, none = (small(kind).fit(Plans(actions, 3, group=group), **QUICK) for group in (torch.zeros(9).long(), None))
+    assert one.log_prob(actions).equal(none.log_prob(actions))
 
 
 @BOTH
