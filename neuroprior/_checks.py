@@ -82,6 +82,11 @@ def kind_of(value: object) -> str:
     return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
 
 
+def describe(value: object) -> str:
+    """The dtype and shape of a tensor; of anything else, the name of its class."""
+    return f"{value.dtype} {list(value.shape)}" if isinstance(value, Tensor) else kind_of(value)
+
+
 def as_list(name: str, values: Any) -> list[Any]:
     """A list of the values, numpy's and torch's as Python's numbers; raises ValueError for a single one."""
     found = values.tolist() if hasattr(values, "tolist") else values

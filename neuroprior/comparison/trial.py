@@ -24,7 +24,7 @@ from neuroprior.planners import (
 from neuroprior.plans import Plans
 from neuroprior.priors import UniformPrior
 from neuroprior.sampling import sample_in_world
-from neuroprior.worlds import Categories, TabularWorld, World
+from neuroprior.worlds import Categories, SimulatorWorld, TabularWorld, World
 
 RANDOM_PLANS = 64
 """Random plans from each held-out start, whose mean score counts as 0."""
@@ -34,6 +34,9 @@ TRAINING_RANDOM_PLANS = 16
 
 SCORE_ROLLOUTS = 64
 """Fresh rollouts that score a plan in a stochastic world that is no table."""
+
+MAX_SAME = 64
+"""Starts of simulators that are compared; where all hold the same, so do the others."""
 
 MIN_LEARNED = 20
 """Fewer plans than this are not learned from."""
@@ -173,7 +176,7 @@ def draw_starts(design: Design, generator: torch.Generator) -> tuple[Tensor, Ten
     pool = design.world.reset(2 * (wanted + kept), generator)
     which = pool.cpu().unique(dim=0, return_inverse=True)[1]
     distinct = int(which.max()) + 1
-    if distinct == 1:
+    if distinct == 1 or (isinstance(design.world, SimulatorWorld) and design.world.are_same(pool[:MAX_SAME])):
         return pool[:wanted], pool[:kept], True
     chosen = torch.zeros(distinct, dtype=torch.bool)
     chosen[torch.randperm(distinct, generator=generator)[: min(kept, -(-distinct // 4))]] = True

@@ -196,7 +196,8 @@ class Prior(SavedModule):
             context: None, or `[N, L]`, `[N, L, C]` or `[N, L, F]`.
 
         Returns:
-            Logits `[N, L, A]`, equal to those that stepping gives. This default steps.
+            Logits `[N, L, A]`, equal to those that stepping gives. This default steps. Plans are not checked here,
+            but in `forecasts`, `log_prob` and `action_log_probs`.
         """
         num, length = plans.shape
         if length == 0:

@@ -1,12 +1,13 @@
 """Sampling plans from any prior: one by one, by prefix tree, or together with a world."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, TypeAlias
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_count, check_memory, check_range, check_sizes, is_integer
+from neuroprior._checks import check_count, check_memory, check_range, check_sizes, describe, is_integer
 from neuroprior._random import generator_on
 from neuroprior._threads import share
 from neuroprior.plans.plans import action_dtype
@@ -66,8 +67,8 @@ def sample(
         state: instead of a past, what the prior's `start` or its last `step` returned: logits and state, of one row,
             which all plans go on from, or of N rows. So a planner that executes and replans steps its prior once for
             each executed action. It is left as it is. A context, one per step, is then that of the steps to come.
-        mask: which actions may be drawn: bool `[A]`, `[L, A]` or `[N, L, A]`; or a function of the actions drawn,
-            int64 `[N, t]`, that returns bool `[N, A]`.
+        mask: which actions may be drawn: bool (or integers 0 and 1) `[A]`, `[L, A]` or `[N, L, A]`; or a function of
+            the actions drawn, int64 `[N, t]`, that returns bool `[N, A]`.
         temperature: divides the logits; below 1 sharper, above 1 flatter.
         generator: the source of randomness; the same seed gives the same plans.
         method: see above. With a mask, a context per step, features, pasts `[N, T]` or a state of N rows, plans are
@@ -367,15 +368,17 @@ def _sample_masked(
 def _allowed(mask: Tensor | Mask, plans: Tensor, step: int, num_actions: int) -> Tensor:
     """Which actions may be drawn next, bool `[A]` or `[N, A]`, in `plans [N, L]` of which `step` actions are drawn."""
     num_plans, length = plans.shape
-    allowed = torch.as_tensor(mask(plans[:, :step]) if callable(mask) else mask)
+    allowed = mask(plans[:, :step]) if callable(mask) else mask
+    if isinstance(allowed, Sequence | np.ndarray):
+        allowed = torch.as_tensor(allowed)
+    if isinstance(allowed, Tensor) and is_integer(allowed) and ((allowed == 0) | (allowed == 1)).all():
+        allowed = allowed.bool()
     shapes = [[num_actions], [length, num_actions], [num_plans, length, num_actions]]
     if callable(mask):
         shapes = [[num_plans, num_actions]]
-    if allowed.dtype != torch.bool or list(allowed.shape) not in shapes:
+    if not isinstance(allowed, Tensor) or allowed.dtype != torch.bool or list(allowed.shape) not in shapes:
         due = " or ".join(map(str, shapes))
-        raise ValueError(
-            f"`mask` must {'return' if callable(mask) else 'be'} bool {due}, got {allowed.dtype} {list(allowed.shape)}"
-        )
+        raise ValueError(f"`mask` must {'return' if callable(mask) else 'be'} bool {due}, got {describe(allowed)}")
     return allowed if callable(mask) or allowed.dim() == 1 else allowed[..., step, :]
 
 

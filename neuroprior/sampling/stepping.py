@@ -7,7 +7,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_same_names, is_integer
+from neuroprior._checks import check_same_names, describe, is_integer
 from neuroprior._threads import one_thread
 from neuroprior.sampling.draws import Draw, after_end, are_few
 from neuroprior.sampling.states import State
@@ -85,7 +85,7 @@ class Stepper:
         """Where the prior computes."""
         device = getattr(self._prior, "device", None)
         if device is None:  # no context is known yet that could be given to `start`
-            device = "cpu" if self.context_per is not None else self._prior.start(1)[0].device
+            device = "cpu" if self.context_per is not None else getattr(self._prior.start(1)[0], "device", "cpu")
         return torch.device(device)
 
     @cached_property
@@ -113,9 +113,16 @@ class Stepper:
             )
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, State]:
-        """Logits `[N, A]` of the first action, and the state."""
+        """Logits `[N, A]` of the first action, and the state.
+
+        Raises:
+            ValueError: the prior gives other logits.
+        """
         with self.threads_for(batch_size):
             logits, state = self._prior.start(batch_size) if context is None else self._prior.start(batch_size, context)
+        due = [batch_size, self.num_actions]
+        if not isinstance(logits, Tensor) or not logits.is_floating_point() or list(logits.shape) != due:
+            raise ValueError(f"`prior` must start with floating point logits {due}, got {describe(logits)}")
         return logits, state
 
     def step(self, action: Tensor, state: State, context: Tensor | None = None) -> tuple[Tensor, State]:

@@ -1,16 +1,18 @@
 """The conformance suite of priors."""
 
 import tempfile
+from copy import deepcopy
 from functools import partial
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from neuroprior._checks import describe, kind_of
 from neuroprior.plans import Plans, all_plans
 from neuroprior.priors import Prior, load, save
 from neuroprior.sampling.ancestral import sample
-from neuroprior.sampling.states import select_rows
+from neuroprior.sampling.states import map_state, select_rows, tensors_in
 from neuroprior.testing.chi_square import chi_square
 from neuroprior.testing.rules import FALSE_ALARM, PRIOR_CHECKS, check_by_kind, raises, require
 
@@ -18,6 +20,7 @@ from neuroprior.testing.rules import FALSE_ALARM, PRIOR_CHECKS, check_by_kind, r
 def check_prior(prior: Any, length: int | None = None, num_plans: int = 20_000, seed: int = 0) -> None:
     """Raise AssertionError, with a message that says how, unless `prior` does what a prior must.
 
+    `fit` returns the prior (tried of those without settings), and `step` leaves the state that it is given as it is.
     With each kind of context that it takes: stepping equals `forward`, also past its window and after states were
     reordered, and `advance` equals stepping; `log_prob` sums to one over all plans of a length and fits what `sample`
     draws, by prefix tree and plan by plan (chi-square tests, each with a false alarm of 1e-6); the same seed gives the
@@ -51,6 +54,7 @@ def check_prior(prior: Any, length: int | None = None, num_plans: int = 20_000, 
         for steps in (1, length, window + 3):
             plans = torch.randint(actions, (7, steps), generator=generator).to(prior.device)
             context = _random_context(prior, 7, steps, generator, stays)
+            _check_outputs(prior, plans, context)
             _check_stepping(prior, plans, context, stays)
         _check_total(prior, _random_context(prior, 1, length, generator, stays), length)
         for method in ("tree", "ancestral"):
@@ -58,6 +62,7 @@ def check_prior(prior: Any, length: int | None = None, num_plans: int = 20_000, 
             _check_samples(prior, context, length, num_plans, method, generator)
         _check_seeds(prior, length, generator)
     _check_copies(prior, length, generator)
+    _check_fit(prior, length, generator)
     if type(prior).__module__.startswith("neuroprior."):
         _check_refusals(prior, generator)
 
@@ -79,6 +84,41 @@ def _random_context(
     if prior.context_size is None:
         return None
     return torch.randn(*shape, prior.context_size, generator=generator).to(prior.device)
+
+
+@torch.no_grad()
+def _check_outputs(prior: Prior, plans: Tensor, context: Tensor | None) -> None:
+    """`start` and `step` return floating point logits `[N, A]` and a state, and leave the state before as it is."""
+    due, given = [len(plans), prior.num_actions], _at(context, 0)
+    state: Any = None
+    kept: Any = None
+    for method in ("start", "step"):
+        result = prior.start(len(plans), given) if method == "start" else prior.step(plans[:, 0], state, given)
+        require(isinstance(result, tuple) and len(result) == 2, f"{method} must return logits and a state")
+        logits, after = result
+        right = isinstance(logits, Tensor) and logits.is_floating_point() and list(logits.shape) == due
+        require(right, f"{method} must return floating point logits {due}, got {describe(logits)}")
+        require(
+            _has_rows(after, len(plans)),
+            f"{method}: state must be a tensor of {len(plans)} rows, or a tuple of such tensors, got {describe(after)}",
+        )
+        if kept is not None:
+            same = all(map(torch.equal, tensors_in(kept), tensors_in(state)))
+            require(same, "step must leave the state that it is given as it is, and return another")
+        kept, state = map_state(torch.clone, after), after
+
+
+def _check_fit(prior: Prior, length: int, generator: torch.Generator) -> None:
+    """`fit` returns the prior itself, of which a copy learns: not of those whose training takes long."""
+    if prior.fit_settings:
+        return
+    context, copy = _random_context(prior, 7, length, generator), deepcopy(prior)
+    plans = torch.randint(prior.num_actions, (7, length), generator=generator).to(prior.device)
+    try:
+        result = copy.fit(Plans(plans, prior.num_actions, context=context), generator=generator)
+    except ValueError:  # it cannot learn from these
+        return
+    require(result is copy, f"fit must return the prior itself, got {kind_of(result)}")
 
 
 @torch.no_grad()
@@ -107,8 +147,6 @@ def _check_stepping(prior: Prior, plans: Tensor, context: Tensor | None, stays: 
     for t in range(length):
         kind = "no context" if context is None else f"context {list(context.shape)}"
         where = f"plans of length {length}, action {t}, {kind}"
-        require(_has_rows(state, num), f"state must be a tensor of {num} rows, or a tuple of such tensors ({where})")
-        require(logits.shape == (num, prior.num_actions), f"logits {list(logits.shape)} ({where})")
         gap = float((logits.log_softmax(-1) - whole[:, t]).abs().nan_to_num(0).max())
         require(gap < rounding, f"stepping differs from forward by {gap:.2g} nats ({where})")
         if t + 1 < length:

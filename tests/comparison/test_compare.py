@@ -14,7 +14,8 @@ from neuroprior.comparison import Row, experiment
 from neuroprior.comparison.contestants import fit_markov, fit_prior, learns, make_planner, name_priors
 from neuroprior.comparison.trial import Design, draw_starts, run_seed, training_plans, true_scores
 from neuroprior.planners import Decision, Planner
-from neuroprior.worlds import Categories, EpisodicWorld
+from neuroprior.worlds import Categories, EpisodicWorld, from_simulator
+from tests.support import simulators
 from tests.support.sources import refuses
 
 LENGTH = 4
@@ -396,3 +397,14 @@ def test_worlds_that_cannot_be_sent_are_compared_in_one_process(monkeypatch):
 
 def test_the_baseline_comes_first():
     assert list(name_priors(["markov", "uniform"], path_world())) == ["uniform", "markov"]
+
+
+@pytest.mark.parametrize("simulator", [simulators.Walk, simulators.Walk(), [simulators.Walk(), simulators.Walk()]])
+def test_simulators_that_all_begin_alike_are_named(simulator):
+    comparison = compare(from_simulator(simulator, 2), ["markov"], ["sampling"], [4], **QUICK | {"seeds": 1})
+    assert sum("All starts are the same state" in note for note in comparison.notes) == 1
+
+
+def test_simulators_that_begin_otherwise_are_held_out():
+    comparison = compare(from_simulator(simulators.NoisyStart), ["markov"], ["sampling"], [4], **QUICK | {"seeds": 1})
+    assert not any("All starts are the same state" in note for note in comparison.notes)

@@ -4,7 +4,17 @@ import numpy as np
 import pytest
 import torch
 
-from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior
+from neuroprior import (
+    FrontierPlanner,
+    GRUPrior,
+    MarkovPrior,
+    MCTSPlanner,
+    Plans,
+    SamplingPlanner,
+    TabularWorld,
+    TransformerPrior,
+    sample,
+)
 from neuroprior.sampling.states import map_state
 from tests.support.sources import every_plan, fits, refuses, seeded
 
@@ -125,6 +135,10 @@ def test_what_is_no_mask_or_state_is_refused():
         chain.sample(3, 2, mask=torch.ones(3, 4, dtype=torch.bool))
     with refuses("mask", "must return bool [3, 4], got torch.bool [4]"):
         chain.sample(3, 2, mask=lambda plans: torch.ones(4, dtype=torch.bool))
+    with refuses("`mask` must return bool [3, 4], got NoneType"):
+        chain.sample(3, 2, mask=lambda plans: None)
+    with refuses("`mask` must be bool", "got torch.int64 [4]"):
+        chain.sample(3, 2, mask=torch.tensor([0, 1, 2, 1]))
     with refuses("`mask` must allow an action in each plan"):
         chain.sample(3, 2, mask=torch.zeros(4, dtype=torch.bool))
     with refuses("state", "of 1 row or of num_plans = 3"):
@@ -135,3 +149,45 @@ def test_what_is_no_mask_or_state_is_refused():
         chain.sample(2, 2, state=state, past=PAST)
     with refuses("context", "one per step with a state"):
         PRIORS["chain in contexts"].sample(2, 2, torch.tensor([0, 1]), state=stepped(PRIORS["chain in contexts"], 2))
+
+
+@pytest.mark.parametrize("mask", [[0, 0, 1, 0], torch.tensor([0, 0, 1, 0]), torch.tensor([0, 0, 1, 0]).bool()])
+def test_masks_may_be_ones_and_zeros(mask):
+    assert (PRIORS["chain"].sample(5, 3, mask=mask) == 2).all()
+
+
+class Logits:
+    """A prior whose logits are as given."""
+
+    num_actions = 3
+
+    def __init__(self, logits):
+        self.logits = logits
+
+    def start(self, batch_size):
+        wide = (
+            self.logits.repeat(batch_size, 0)
+            if isinstance(self.logits, np.ndarray)
+            else self.logits.expand(batch_size, -1)
+        )
+        return wide, torch.zeros(batch_size, 1)
+
+    def step(self, action, state):
+        return self.start(len(action))[0], state
+
+
+@pytest.mark.parametrize(
+    ("logits", "words"),
+    [
+        (torch.zeros(1, 4), "got torch.float32 [{}, 4]"),
+        (torch.zeros(1, 3, dtype=torch.long), "got torch.int64 [{}, 3]"),
+        (np.zeros((1, 3)), "got ndarray"),
+    ],
+)
+def test_logits_that_are_none_are_refused_by_samplers_and_planners(logits, words):
+    prior, world = Logits(logits), TabularWorld(torch.zeros(2, 3, dtype=torch.long), torch.zeros(2, 3))
+    with refuses("`prior` must start with floating point logits", words.format(1)):
+        sample(prior, 5, 2)
+    for planner in (SamplingPlanner, FrontierPlanner, MCTSPlanner):
+        with refuses("`prior` must start with floating point logits", words.format(1)):
+            planner(prior, 2, 4).plan(world, torch.zeros(1, dtype=torch.long))

@@ -214,6 +214,45 @@ class ReadsContext(Prior):
         return self
 
 
+class OneMore(Broken):
+    """Gives one more logit."""
+
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        logits, state = super().start(batch_size)
+        return torch.nn.functional.pad(logits, (0, 1)), state
+
+
+class Integers(Broken):
+    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        logits, state = super().step(action, state)
+        return logits.long(), state
+
+
+class Arrays(Broken):
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        logits, state = super().start(batch_size)
+        return logits.numpy(), state  # type: ignore[return-value]
+
+
+class LogitsAlone(Broken):
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        return super().start(batch_size)[0]  # type: ignore[return-value]
+
+
+class Overwrites(Broken):
+    """Changes the state that it is given."""
+
+    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        logits, after = super().step(action, state)
+        return logits, state.copy_(after)
+
+
+class FitsToNothing(Broken):
+    def fit(self, plans: Plans | Tensor, **settings: object) -> Self:
+        super().fit(plans)
+        return None  # type: ignore[return-value]
+
+
 class Unsavable(Broken):
     """Its `config` is not what its constructor takes."""
 
@@ -232,6 +271,12 @@ class Unsavable(Broken):
         (partial(Forgetful, bonus=1.0), "saved, loaded"),
         (ReadsContext, "step: .* `step` is given None where the last context goes on"),
         (Unsavable, "cannot be saved and loaded"),
+        (OneMore, r"^start must return floating point logits \[7, 3\], got torch.float32 \[7, 4\]$"),
+        (Integers, r"^step must return floating point logits \[7, 3\], got torch.int64 \[7, 3\]$"),
+        (Arrays, r"^start must return floating point logits \[7, 3\], got ndarray$"),
+        (LogitsAlone, "^start must return logits and a state$"),
+        (Overwrites, "^step must leave the state that it is given as it is, and return another$"),
+        (FitsToNothing, "^fit must return the prior itself, got NoneType$"),
     ],
 )
 def test_a_broken_prior_fails_with_a_message(broken: Callable[[], Prior], message: str) -> None:

@@ -482,7 +482,15 @@ REFUSED = {
     ),
     "names": (lambda: from_simulator(simulators.Walk(), 2, action_names=["up"]), "`action_names` must have 2 names"),
     "workers": (lambda: from_simulator(simulators.Walk(), 2, workers=0), "`workers` must be"),
-    "no step": (lambda: from_simulator(simulators.Walk(), 2).state_of(3), "must have a method `step`, got int"),
+    "no step": (lambda: from_simulator(simulators.Walk(), 2).state_of(3), "must be of the world's class Walk, got int"),
+    "another class": (
+        lambda: from_simulator(simulators.Walk(), 2).state_of([simulators.Walk(), simulators.Cells()]),
+        "must be of the world's class Walk, got Cells",
+    ),
+    "another environment": (
+        lambda: from_simulator(simulators.NoisyStart).state_of(gymnasium.make("CartPole-v1")),
+        "must be of the world's class NoisyStart",
+    ),
 }
 
 
@@ -552,3 +560,13 @@ def test_the_frontier_planner_reaches_no_state_twice(monkeypatch):
     decision = FrontierPlanner(UniformPrior(2), 12, 32).plan(world, state, seeded(1))
     assert decision.score.tolist() == [1, 1, 1, 1]
     assert sorted(reached) == state.tolist()
+
+
+def test_simulators_that_hold_the_same_are_found():
+    world = from_simulator(simulators.Walk, 2)
+    state = world.reset(5, seeded(0))
+    assert state.unique().numel() == 5
+    assert world.are_same(state)
+    assert not world.are_same(torch.cat([state, world.step(state, torch.ones(5, dtype=torch.long))[0]]))
+    noisy = from_simulator(simulators.NoisyStart)
+    assert not noisy.are_same(noisy.reset(40, seeded(0)))

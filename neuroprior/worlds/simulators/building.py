@@ -135,6 +135,7 @@ def from_simulator(
             kept = starts if make is None or seeds is not None else []
             world = SimulatorWorld(driver, copier, noise, make, kept, workers)
             world.objective, world.discount = objective, discount
+            world.kinds = tuple({type(getattr(one, "unwrapped", one)) for one in originals or [example]})
             world.action_names = None if action_names is None else tuple(action_names)
             return world
     if isinstance(problem, ValueError):

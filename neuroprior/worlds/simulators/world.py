@@ -13,6 +13,7 @@ from neuroprior._random import generator_on
 from neuroprior.worlds.observations import Categories
 from neuroprior.worlds.simulators.copies import Copier, ReplayCopier
 from neuroprior.worlds.simulators.driver import Driver, Path, View, follow_plans
+from neuroprior.worlds.simulators.fingerprints import fingerprint
 from neuroprior.worlds.simulators.generators import (
     keep_global_generators,
     seed_generators,
@@ -54,11 +55,13 @@ class SimulatorWorld(World):
         objective, discount: what counts in this world.
         driver, copier, starts: as given.
         prepare: a function from a simulator that `state_of` is given to one of the same kind as the others, or None.
+        kinds: classes of simulators that `state_of` takes, without wrappers; none: any.
         max_snapshots: the most copies that are kept.
     """
 
     objective: Literal["terminal", "return"]
     prepare: Callable[[Any], Any] | None
+    kinds: tuple[type, ...] = ()
 
     def __init__(
         self,
@@ -117,9 +120,16 @@ class SimulatorWorld(World):
             simulator: one simulator, or a list of them; they stay as they are.
             observation: what its last `step` returned (a list for a list); only where that is observed.
             info: likewise; only where its `action_mask` says which actions are legal.
+
+        Raises:
+            ValueError: a simulator is of another class.
         """
         several = isinstance(simulator, list | tuple)
         each = list(simulator) if several else [simulator]
+        for one in each:
+            if self.kinds and not isinstance(getattr(one, "unwrapped", one), self.kinds):
+                names = " or ".join(kind.__name__ for kind in self.kinds)
+                raise ValueError(f"`simulator` must be of the world's class {names}, got {kind_of(one)}")
         observations, infos = (list(x) if several and x is not None else [x] * len(each) for x in (observation, info))
         with keep_global_generators():
             found = [
@@ -127,6 +137,12 @@ class SimulatorWorld(World):
                 for one, *seen in zip(each, observations, infos, strict=True)
             ]
         return torch.tensor(found, dtype=torch.long)
+
+    def are_same(self, state: Tensor) -> bool:
+        """Whether simulators in `state [N]` hold the same, as far as that can be read, beside random generators."""
+        with keep_global_generators():
+            held = {handle: fingerprint(self._load(handle)) or str(handle) for handle in set(state.tolist())}
+        return len(set(held.values())) == 1
 
     def forget(self) -> None:
         """Free the memory of all simulators but those that `reset` returns, after a long run.
