@@ -1,4 +1,4 @@
-"""`python -m eval study`: does the comparison of conditions find what is there, and nothing else?"""
+"""`python -m eval study`: do the tests of conditions, drift, lags and survival find what is there, and nothing else?"""
 
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -6,14 +6,15 @@ from math import ceil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import torch
 from jsonargparse.typing import NonNegativeInt, PositiveInt
 from scipy import stats
 
+from eval.study import time_tests
+from eval.study.time_tests import recordings_of
 from neuroprior._jobs import JobRun
-from neuroprior.behaviour import Recordings, compare_conditions, share_interval, simulated_study
+from neuroprior.behaviour import compare_conditions, share_interval, simulated_study
 from neuroprior.behaviour.reporting.document import Document, publish, table
 from neuroprior.behaviour.reporting.page import Section, Table
 from neuroprior.behaviour.study import LONGER, MOVED
@@ -56,8 +57,9 @@ class Batch:
 
 
 def study(
-    studies: PositiveInt = 1000,
+    studies: NonNegativeInt = 1000,
     with_effect: PositiveInt = 200,
+    time_studies: NonNegativeInt = 200,
     actions: PositiveInt = 100,
     permutations: PositiveInt = 999,
     seed: NonNegativeInt = 0,
@@ -65,13 +67,14 @@ def study(
     dask: str | None = None,
     out: str = "runs/study",
 ) -> None:
-    """Simulated studies with known truth: how often each test of conditions finds an effect that is there, or is not.
+    """Simulated studies with known truth: how often each test finds an effect that is there, or is not.
 
     Animals with two sessions each; see `neuroprior.behaviour.simulated_study`.
 
     Args:
-        studies: simulated studies without an effect, for each design.
+        studies: simulated studies without an effect, for each design; 0: conditions are not compared.
         with_effect: simulated studies with one.
+        time_studies: simulated studies of drift, lags and survival, for each source; 0: none.
         actions: behaviours in each session.
         permutations: random ones of each test at most.
         seed: of the first study; the others follow.
@@ -79,28 +82,43 @@ def study(
         dask: address of a Dask scheduler; None: this machine.
         out: folder for tables (CSV), `results.json` and `report.html`.
     """
-    jobs = [
-        Batch(design, effect, number)
-        for effect in (True, False)
-        for design in DESIGNS
-        for number in range(-(-(with_effect if effect else studies) // TOGETHER))
-    ]
-    numbers = {"studies": studies, "with_effect": with_effect, "actions": actions, "permutations": permutations}
-    numbers["seed"] = seed
-    run = JobRun(partial(compared, numbers), Path(out) / "jobs", numbers)
-    found = run.do(jobs, processes=processes, dask=dask, title="studies")
-    rows = [asdict(job) | row for job, some in zip(jobs, found, strict=True) for row in some]
-    frame = pd.DataFrame(
-        rows, columns=["design", "effect", "kind", "study", "level", "test", "p", "corrected", "feature"]
-    )
-    tests = _shares(frame[frame["kind"] == "test"])
-    features = _features(frame[frame["kind"] == "feature"], with_effect)
+    numbers = {"studies": studies, "with_effect": with_effect, "time_studies": time_studies, "actions": actions}
+    numbers |= {"permutations": permutations, "seed": seed}
+    sections, frames, folder = list[Section](), dict[str, pd.DataFrame](), Path(out) / "jobs"
+    if studies:
+        jobs = [
+            Batch(design, effect, number)
+            for effect in (True, False)
+            for design in DESIGNS
+            for number in range(-(-(with_effect if effect else studies) // TOGETHER))
+        ]
+        run = JobRun(partial(compared, numbers), folder, numbers)
+        found = run.do(jobs, processes=processes, dask=dask, title="studies")
+        rows = [asdict(job) | row for job, some in zip(jobs, found, strict=True) for row in some]
+        frame = pd.DataFrame(
+            rows, columns=["design", "effect", "kind", "study", "level", "test", "p", "corrected", "feature"]
+        )
+        frames["tests"] = _shares(frame[frame["kind"] == "test"])
+        frames["features"] = _features(frame[frame["kind"] == "feature"], with_effect)
+        tables = [_test_table(frames["tests"], studies), _feature_table(frames["features"])]
+        sections.append(Section("Conditions", tables=tables))
+    if time_studies:
+        batches = [
+            time_tests.Batch(source, number)
+            for source in time_tests.SOURCES
+            for number in range(-(-time_studies // time_tests.TOGETHER))
+        ]
+        timed = JobRun(partial(time_tests.tested, numbers), folder, numbers)
+        results = timed.do(batches, processes=processes, dask=dask, title="studies of time")
+        frames["time"] = time_tests.share_starred(list(zip(batches, results, strict=True)))
+        sections.append(Section("Time", tables=[time_tests.starred_table(frames["time"])]))
     publish(
         Document(
-            "Simulated studies of conditions",
-            f"{studies} studies without an effect for each design, {with_effect} with one",
-            [Section("Conditions", tables=[_test_table(tests, studies), _feature_table(features)])],
-            {"tests": tests, "features": features},
+            "Simulated studies of behaviour",
+            f"{studies} studies of conditions without an effect for each design, {with_effect} with one;"
+            f" {time_studies} of drift, lags and survival for each source",
+            sections,
+            frames,
             numbers,
             keys={"tests": "rows"},
         ),
@@ -131,19 +149,6 @@ def compared(numbers: dict[str, int], batch: Batch) -> list[dict[str, Any]]:
                 spelled = " ".join(names[action] for action in family.features[feature].tolist())
                 rows.append({"kind": "feature", **common, "test": family.name, "feature": spelled})
     return rows
-
-
-def recordings_of(events: pd.DataFrame) -> Recordings:
-    """Return what `neuroprior.behaviour.read` finds in a simulated study, without its checks, which take longer."""
-    missing = events["behaviour"].isna().to_numpy()
-    recording = (events["animal"] + " " + events["session"].astype(str)).factorize()[0]
-    fragment = np.cumsum((np.diff(recording, prepend=-1) != 0) | missing | np.append(False, missing[:-1]))
-    columns = {"animal": "subject", "session": "recording"}
-    kept = events[~missing].rename(columns=columns).drop(columns="observer").astype({"recording": str})
-    factors = [name for name in ("treatment", "sex") if name in events]
-    return Recordings(
-        kept.reset_index(drop=True), np.unique(fragment[~missing], return_inverse=True)[1], "s", (), factors
-    )
 
 
 def _shares(tests: pd.DataFrame) -> pd.DataFrame:

@@ -3,10 +3,12 @@
 import json
 from types import SimpleNamespace
 
+import pandas as pd
 import pytest
 
 from eval.__main__ import main
 from eval.study import command
+from eval.study.time_tests import SOURCES, timed_study
 from neuroprior.behaviour import read
 
 pytestmark = pytest.mark.usefixtures("undrawn")
@@ -14,7 +16,19 @@ pytestmark = pytest.mark.usefixtures("undrawn")
 
 def test_studies_with_and_without_an_effect(tmp_path, capsys):
     out = tmp_path / "study"
-    arguments = ["study", "--studies", "2", "--with-effect", "2", "--permutations", "199", "--actions", "150"]
+    arguments = [
+        "study",
+        "--studies",
+        "2",
+        "--with-effect",
+        "2",
+        "--time-studies",
+        "2",
+        "--permutations",
+        "199",
+        "--actions",
+        "150",
+    ]
     arguments += ["--seed", "0", "--processes", "1", "--out", str(out)]
     assert main(arguments) == 0
     found = json.loads((out / "results.json").read_text())
@@ -30,6 +44,10 @@ def test_studies_with_and_without_an_effect(tmp_path, capsys):
     for feature in ("durations: rest", "transitions: rear groom"):
         assert by_feature["12 against 12", feature]["found"] == 2
     assert by_feature["8 paired", "any other transition or duration"]["planted"] is False
+    time = {(row["source"], row["test"]): row for row in found["time"]}
+    assert {*time} == {(source, test) for source, kinds in SOURCES.items() for test in kinds}
+    # A doubled median of resting is found in both of 12 animals with 150 behaviours in each session.
+    assert time["rest lasts longer", "survival, rest"]["starred"] == 1
     assert "False alarms" in capsys.readouterr().out
     (kept,) = (out / "jobs").iterdir()
     changed = {path.name: path.stat().st_mtime_ns for path in kept.glob("*.json")}
@@ -65,6 +83,30 @@ def test_recordings_are_those_that_are_read(options):
         assert (first is None and second is None) or first.nan_to_num().equal(second.nan_to_num())
 
 
+def test_studies_of_time_are_what_they_say():
+    """Over 40 studies sniffing fades, grooming follows the ritual, resting lasts twice as long under the drug."""
+
+    def many(source):
+        tables = [timed_study(seed, source, 100).assign(seed=seed) for seed in range(40)]
+        return pd.concat(tables, ignore_index=True)
+
+    fading = many("sniff fades")
+    third = fading.groupby(["seed", "animal", "session"]).cumcount() // 34
+    shares = (fading.behaviour == "sniff").groupby(third).mean()
+    # From the first third to the last the odds fall by e^(0.4 * 2 / 3), and with them the share by a fifth.
+    assert shares[2] / shares[0] == pytest.approx(0.79, abs=0.05)
+    for source, share in (("order 1", 1 / 5), ("one ritual", 6 / 10)):
+        study = many(source)
+        there = (study.behaviour.shift(2) == "eat") & (study.behaviour.shift(1) == "drink") & study.behaviour.notna()
+        there &= study.groupby(["seed", "animal", "session"]).cumcount() > 1
+        assert (study.behaviour[there] == "groom").mean() == pytest.approx(share, abs=0.06)
+        assert study.behaviour.isna().mean() == pytest.approx(0.05, abs=0.005)
+    study = many("rest lasts longer")
+    lasts = (study.stop - study.start).groupby([study.behaviour, study.treatment]).median().unstack()
+    assert lasts.drug["rest"] / lasts.saline["rest"] == pytest.approx(2, rel=0.1)
+    assert lasts.drug["walk"] / lasts.saline["walk"] == pytest.approx(1, rel=0.1)
+
+
 def test_bad_numbers(tmp_path, capsys):
-    assert main(["study", "--studies", "0", "--out", str(tmp_path)]) == 2
-    assert "studies" in capsys.readouterr().err
+    assert main(["study", "--actions", "0", "--out", str(tmp_path)]) == 2
+    assert "actions" in capsys.readouterr().err
