@@ -127,7 +127,7 @@ class SimulatorWorld(World):
         several = isinstance(simulator, list | tuple)
         each = list(simulator) if several else [simulator]
         for one in each:
-            if self.kinds and not isinstance(getattr(one, "unwrapped", one), self.kinds):
+            if self.kinds and type(getattr(one, "unwrapped", one)) not in self.kinds:
                 names = " or ".join(kind.__name__ for kind in self.kinds)
                 raise ValueError(f"`simulator` must be of the world's class {names}, got {kind_of(one)}")
         observations, infos = (list(x) if several and x is not None else [x] * len(each) for x in (observation, info))
