@@ -24,6 +24,7 @@ from neuroprior import (
     gridworld,
 )
 from neuroprior.behaviour import RecordedPlans, SemiMarkovPrior
+from neuroprior.priors import AdaptivePrior
 from neuroprior.puzzles import LogLinearPrior, sliding_tiles, sokoban
 from neuroprior.testing import check_prior, check_world
 from neuroprior.testing.chi_square import alike, chi_square
@@ -71,6 +72,10 @@ PRIORS = {
     "context tree, context a step": lambda: ContextTreePrior(3, 0, num_contexts=4).fit(
         random_plans(3, index_context(60, 5))
     ),
+    "adaptive": lambda: AdaptivePrior(MarkovPrior(3, 1), [4.0, 2.0, 0.5], 0.8).fit(random_plans(3)),
+    "adaptive, of an individual": lambda: AdaptivePrior(
+        ContextTreePrior(3, 2, num_contexts=4).fit(random_plans(3, index_context(60, 5))), [3.0, 1.0]
+    ).adapted_to(random_plans(3, index_context(60, 5))),
     "log-linear untrained": lambda: LogLinearPrior(4, 2),
     "log-linear": lambda: LogLinearPrior(3, 2).fit(random_plans(3, pattern_context(60, 5))),
     "gru untrained": lambda: GRUPrior(4),
