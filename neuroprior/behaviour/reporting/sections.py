@@ -20,7 +20,7 @@ from neuroprior.behaviour.reporting import figures
 from neuroprior.behaviour.reporting.conditions import condition_section
 from neuroprior.behaviour.reporting.document import Column, table
 from neuroprior.behaviour.reporting.durations import duration_section
-from neuroprior.behaviour.reporting.findings import Finding, p_words
+from neuroprior.behaviour.reporting.findings import Finding, gain_finding, p_words
 from neuroprior.behaviour.reporting.individuals import individual_section
 from neuroprior.behaviour.reporting.modes import mode_section
 from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
@@ -158,7 +158,9 @@ def lag_section(found: Evaluation) -> Part | None:
     findings, verdicts = list[Finding](), list[str]()
     if result is not None:
         frame = frames["how_far_back"] = result.frame()
-        findings, verdicts = _lag_findings(frame), [] if result.few else [result.verdict]
+        for row in frame.assign(starred=frame["adds"]).to_dict("records"):
+            findings.append(gain_finding("lags", f"lag {row['lag']}", f"The behaviour {row['lag']} back", row))
+        verdicts = [] if result.few else [result.verdict]
         text += [without_verdict(result.few) or result.verdict]
         columns: dict[str, Column] = {
             "lag": "lag",
@@ -183,19 +185,6 @@ def lag_section(found: Evaluation) -> Part | None:
         caption = f"Bits that the action k steps back adds; intervals over {unit_name(found.first_fold)} of one fold."
         boxes = [FigureBox(figures.lag_figure(found.gains), caption, "Gain by lag.", "lags")]
     return Part(Section("How far back", text, tables, boxes), frames, verdicts, findings)
-
-
-def _lag_findings(frame: pd.DataFrame) -> list[Finding]:
-    found = []
-    for row in frame.to_dict("records"):
-        gain, low, high, p, corrected = (float(row[what]) for what in ("bits", "low", "high", "p_value", "corrected"))
-        feature = f"lag {row['lag']}"
-        sentence = (
-            f"The behaviour {row['lag']} back adds {gain:.3g} bits to the prediction of the next one, 95 % interval"
-            f" {low:.3g} to {high:.3g}; {p_words(corrected)}."
-        )
-        found.append(Finding(feature, "lags", feature, gain, low, high, p, corrected, bool(row["adds"]), sentence))
-    return found
 
 
 def motif_section(found: Evaluation) -> Part | None:
