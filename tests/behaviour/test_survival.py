@@ -208,6 +208,13 @@ def test_laws_of_durations_that_were_cut_off_are_those_of_scipy(name, law, famil
     found = DurationModel(1, [name]).fit(plans).table()[0].parameters
     want = [log(scale), shape] if name == "lognormal" else [shape, scale]
     assert list(found.values()) == pytest.approx(want, rel=2e-4, abs=2e-4)
+    # Beside an action of which none is cut off, so that its law is there at once.
+    twice = torch.cat([plans.durations, plans.durations])
+    longer = torch.cat([plans.cut_off, torch.zeros_like(plans.cut_off)])
+    beside = RecordedPlans(
+        torch.arange(2).repeat_interleave(30)[:, None].expand(60, 50), 2, durations=twice, cut_off=longer
+    )
+    assert DurationModel(2, [name]).fit(beside).table()[0].parameters == pytest.approx(found, rel=1e-4)
 
 
 def test_a_mixture_is_found_behind_what_was_cut_off():

@@ -126,8 +126,7 @@ def how_far_back(plans: Plans, max_lag: int = 4, skip: int = 0) -> HowFarBack:
         inside = known & (step >= skip)
         if len(np.unique(unit[inside])) < 2:
             break
-        past = np.where(known, np.roll(actions, lag) + 1, 0)
-        history = np.unique(history * (plans.num_actions + 1) + past, return_inverse=True)[1]
+        history = np.unique(history * plans.num_actions + np.roll(actions, lag), return_inverse=True)[1]
         better = bits_after(history, actions, fold, bits, known)
         gain, size = np.zeros(unit.max() + 1), np.bincount(unit[inside], minlength=unit.max() + 1)
         np.add.at(gain, unit[inside], (bits - better)[inside])

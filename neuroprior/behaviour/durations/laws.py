@@ -62,8 +62,7 @@ class Sets(NamedTuple):
 
     def share_ended(self) -> Tensor:
         """`[C]`: the share of durations that were not cut off; at least one is counted."""
-        ones = torch.ones_like(self.log)
-        return self.mean(1 - self.cut_off.double()).maximum(1 / self.sums(ones))
+        return self.mean(1 - self.cut_off.double()).maximum(1 / self.sums(torch.ones_like(self.log)))
 
     def center(self) -> tuple[Tensor, Tensor]:
         """`[C]`: the mean and the standard deviation of the logarithms, the latter of at least `least`."""
@@ -112,15 +111,10 @@ def _exponential(sets: Sets) -> Tensor:
 def _fit_moments(
     sets: Sets, moments: Tensor, maximise: Callable[[Tensor], Tensor], expect: Callable[[Tensor], Tensor]
 ) -> Tensor:
-    """The law `[C, K]` whose likelihood depends on two moments, by expectation maximisation.
+    """Maximise the likelihood of a law `[C, K]` that depends on the means `[C, 2]` of `moments [n, 2]`.
 
-    What was cut off has the moments of longer durations of the law so far (Dempster, Laird and Rubin 1977).
-
-    Args:
-        sets: of durations.
-        moments: `[n, 2]`: of each duration; changed in place where it was cut off.
-        maximise: from means `[C, 2]` to parameters `[C, K]`.
-        expect: from parameters to moments, of each of the `[m]` durations that were cut off.
+    What was cut off has the moments of longer durations of the law so far (Dempster, Laird and Rubin 1977): `expect`
+    has these from the parameters of each.
     """
     fit = maximise(sets.mean(moments))
     for _ in range(CUT_OFF_STEPS if bool(sets.cut_off.any()) else 0):
@@ -188,13 +182,11 @@ def _lognormal(sets: Sets) -> Tensor:
         mean, square = means.unbind(-1)
         return torch.stack([mean, (square - mean.square()).clamp(min=0).sqrt().maximum(sets.least(center + mean))], -1)
 
-    fit = _fit_moments(
-        sets,
-        torch.stack([away, away.square()], -1),
-        maximise,
-        lambda of: torch.stack(_longer_moments(longer, of[:, 0], of[:, 1])[1:], -1),
-    )
-    return torch.stack([center + fit[:, 0], fit[:, 1]], -1)
+    def expect(of: Tensor) -> Tensor:
+        return torch.stack(_longer_moments(longer, of[:, 0], of[:, 1])[1:], -1)
+
+    mean, spread = _fit_moments(sets, torch.stack([away, away.square()], -1), maximise, expect).unbind(-1)
+    return torch.stack([center + mean, spread], -1)
 
 
 def _longer_moments(value: Tensor, mean: Tensor, spread: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -220,10 +212,7 @@ def _two_lognormal(sets: Sets) -> Tensor:
 def _two_normal(
     sets: Sets, value: Tensor, number: Tensor, longer: Tensor, longer_number: Tensor, center: Tensor, spread: Tensor
 ) -> Tensor:
-    """The parameters `[C, 5]` from standardised values `[C, M]` that stand for `number [C, M]` durations each.
-
-    `longer` and `longer_number` are likewise of those that were cut off.
-    """
+    """The parameters `[C, 5]` from standardised values `[C, M]`, each of `number` durations, likewise `longer` ones."""
     center, spread = center[:, None], spread[:, None]
     powers = torch.stack([torch.ones_like(value), value, value.square()], -1)
     share = value.new_full((len(value), 2), 0.5)
@@ -348,12 +337,7 @@ LAWS: dict[LawName, Law] = {
 
 
 def fit_laws(sets: Sets, laws: Sequence[LawName]) -> Tensor:
-    """`[K, C, MOST_PARAMETERS]`: the parameters of K laws in each set; those of an empty set are NaN.
-
-    Args:
-        sets: of durations.
-        laws: names of K laws.
-    """
+    """`[K, C, MOST_PARAMETERS]`: the parameters of K laws, by name, in each set; those of an empty set are NaN."""
     fits = [LAWS[law].fit(sets) for law in laws]
     return torch.stack([functional.pad(own, (0, MOST_PARAMETERS - own.shape[-1])) for own in fits])
 

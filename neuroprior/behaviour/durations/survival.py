@@ -78,19 +78,14 @@ class DurationSurvival:
         return pd.concat(parts, ignore_index=True)
 
     def medians(self) -> pd.DataFrame:
-        """Return a row a behaviour: `behaviour`, the median under each condition, `p_value, corrected`.
-
-        Of two conditions there are `ratio, low, high`, too.
-        """
+        """Return a row a behaviour: `behaviour`, medians by condition, `p_value, corrected, ratio, low, high`."""
         rows: dict[str, dict[str, object]] = {}
         for (behaviour, level), curve in self.curves.items():
             rows.setdefault(behaviour, {"behaviour": behaviour})[f"median, {level}".removesuffix(", ")] = curve.median
         frame = pd.DataFrame(list(rows.values()))
-        columns: dict[tuple[str, ...], Mapping[str, tuple[float, ...]]] = {("p_value", "corrected"): self.tests}
-        columns |= {("ratio", "low", "high"): self.ratios} if self.ratios else {}
-        for names, values in columns.items():
-            for place, name in enumerate(names):
-                frame[name] = [values[key][place] if key in values else np.nan for key in frame["behaviour"]]
+        for place, name in enumerate(("p_value", "corrected", "ratio", "low", "high")):
+            of = {key: (*test, *self.ratios.get(key, [np.nan] * 3))[place] for key, test in self.tests.items()}
+            frame[name] = frame["behaviour"].map(of).astype(float)
         return frame
 
 
@@ -121,7 +116,7 @@ def duration_survival(
         1.0
     """
     times = durations_of(plans)
-    known = plans.mask(end=False) & (times > 0)
+    known = times > 0  # 0 beyond the end of a plan
     if not bool(known.any()):
         raise ValueError("`plans` must have durations above 0, got none")
     time = times[known].double().cpu().numpy()
@@ -188,8 +183,7 @@ def _count_by_unit(time: Array, ended: NDArray[np.bool_], unit: Numbers, units: 
 
 
 def _survive(ends: Array, at_risk: Array) -> Array:
-    survival: Array = (1 - ends / np.where(at_risk > 0, at_risk, 1)).cumprod(-1)
-    return survival
+    return np.asarray((1 - ends / np.where(at_risk > 0, at_risk, 1)).cumprod(-1))
 
 
 def _count_ends(time: Array, ended: NDArray[np.bool_], block: Numbers, cell: Numbers) -> tuple[Array, Array]:
@@ -215,10 +209,7 @@ def _log_rank(ends: Array, expected: Array, labels: torch.Tensor, conditions: in
 
 
 def _ratio_of_means(time: Array, ended: NDArray[np.bool_], block: Numbers, design: PermutationDesign) -> Interval:
-    """Return how many times as long bouts last under the second of two conditions: their restricted means' ratio.
-
-    The interval leaves out one unit at a time, on the scale of logarithms.
-    """
+    """Return the ratio of restricted means, the second condition by the first; the interval leaves out one unit."""
     unit, label, cell = (one.numpy() for one in (design.unit, design.label, design.cell))
     units, under = len(design.units), label[block]
     limit = min(time[under == condition].max() for condition in (0, 1))
@@ -234,8 +225,7 @@ def _ratio_of_means(time: Array, ended: NDArray[np.bool_], block: Numbers, desig
         survival = _survive(weight @ ends, weight @ at_risk)[:, at < limit]
         widths = np.diff(at[at < limit], prepend=0, append=limit)
         logs.append(np.log(widths[0] + survival @ widths[1:]))
-    change = logs[1] - logs[0]
-    group = np.zeros(units, np.int64)  # of units that might exchange places
+    change, group = logs[1] - logs[0], np.zeros(units, np.int64)  # of units that might exchange places
     if design.kind == "between":
         group[unit] = np.unique(cell * 2 + label, return_inverse=True)[1]
     size = np.bincount(group)

@@ -17,7 +17,7 @@ from neuroprior.behaviour.durations.survival import duration_survival
 from neuroprior.behaviour.recorded_plans import RecordedPlans, action_names, durations_of
 from neuroprior.behaviour.reporting import figures
 from neuroprior.behaviour.reporting.document import Column, table
-from neuroprior.behaviour.reporting.findings import Finding, p_words
+from neuroprior.behaviour.reporting.findings import gain_finding
 from neuroprior.behaviour.reporting.fits import ACTIONS, DURATIONS
 from neuroprior.behaviour.reporting.page import FigureBox, Section
 from neuroprior.behaviour.reporting.part import LISTED, Part, p_text, without_verdict
@@ -75,9 +75,7 @@ def duration_section(found: Evaluation) -> Part | None:
     )
     tables = [table(frame[:LISTED], columns, caption, "Durations", "lrrrrrrlr")]
     shown: dict[str, Column] = {"laws": "what", "nats per duration": _gain}
-    caption = (
-        "Over exponential laws of each action, and over the laws of the line above: durations may depend on the next"
-    )
+    caption = "Over exponential laws of each action, and over laws of the line above: durations may depend on the next"
     caption += f" action, too, where that predicts them better. {bounds}"
     tables.append(table(laws, shown, caption, "Laws of durations", "lr"))
     too_few_units = too_few(found.plans)
@@ -96,24 +94,20 @@ def duration_section(found: Evaluation) -> Part | None:
         " above 0, durations carry information that a model of actions alone does not have.",
         *([without_verdict(too_few_units)] if too_few_units else []),
     ]
-    figure = figures.dwell_figure(dwell)
     caption = "Density of the logarithm of durations above 0 (bars), and of the law that was fitted (line)."
-    box = FigureBox(figure, caption, "Dwell times of the actions with their laws.", "dwell")
-    frames = {"durations": frame, "duration_laws": laws, "next_by_duration": following, "dwell": dwell}
+    boxes = [FigureBox(figures.dwell_figure(dwell), caption, "Dwell times of the actions with their laws.", "dwell")]
     survival = duration_survival(found.plans, generator=torch.Generator().manual_seed(0))
+    frames = {"durations": frame, "duration_laws": laws, "next_by_duration": following, "dwell": dwell}
     frames |= {"survival": survival.frame(), "survival_tests": survival.medians()}
     tables.append(survival_table(survival, too_few_units))
-    caption = (
-        "The share of bouts that last longer; bouts that were cut off count as long as they were seen. Bands: 95 %"
-    )
-    boxes = [
-        box,
-        FigureBox(
-            survival_figure(frames["survival"]), f"{caption} intervals over {over}.", "Survival of bouts.", "survival"
-        ),
-    ]
+    caption = "The share of bouts that last longer; bouts that were cut off count as long as they were seen."
+    caption += f" Bands: 95 % intervals over {over}."
+    boxes.append(FigureBox(survival_figure(frames["survival"]), caption, "Survival of bouts.", "survival"))
     unit = found.recordings.unit if found.recordings is not None else ""
-    findings = [*_following_findings(following), *survival_findings(survival, too_few_units, unit)]
+    findings = survival_findings(survival, too_few_units, unit)
+    for row in following.rename(columns={"gain": "bits"}).to_dict("records"):
+        family, what = "next behaviour by duration", f"How long the last behaviour took ({row['model']})"
+        findings.append(gain_finding(family, f"{family}, {row['model']}", what, row))
     return Part(Section("Durations", text, tables, boxes), frames, findings=findings)
 
 
@@ -203,26 +197,10 @@ def _following(found: Evaluation, plans: RecordedPlans, known: Tensor) -> pd.Dat
         if model.inputs == DURATIONS and plain is not None:
             rows.append({"model": model.name} | _compared(plain.score, model.score))
     frame = pd.DataFrame(rows)
-    if rows:
-        # A loss, or a gain that is 0 in three digits, is none that was looked for.
+    if rows:  # a loss, or a gain that is 0 in three digits, is none that was looked for
         frame["corrected"] = holm(frame["p_value"].where(frame["gain"] >= LEAST, 1.0))
         frame["starred"] = (frame["corrected"] < LEVEL) & (not too_few(found.plans))
     return frame
-
-
-def _following_findings(following: pd.DataFrame) -> list[Finding]:
-    """A finding for each model: whether it gains by the last duration."""
-    found = []
-    for row in following.to_dict("records"):
-        gain, low, high, p, corrected = (float(row[what]) for what in ("gain", "low", "high", "p_value", "corrected"))
-        feature = f"next behaviour by duration, {row['model']}"
-        sentence = (
-            f"How long the last behaviour took adds {gain:.3g} bits to the prediction of the next one"
-            f" ({row['model']}), 95 % interval {low:.3g} to {high:.3g}; {p_words(corrected)}."
-        )
-        estimate = (gain, low, high, p, corrected, bool(row["starred"]))
-        found.append(Finding(feature, "next behaviour by duration", feature, *estimate, sentence))
-    return found
 
 
 def _compared(without: Score, known: Score) -> dict[str, Any]:
@@ -259,10 +237,9 @@ def chain_bits(plans: RecordedPlans, known: Tensor) -> tuple[tuple[Tensor, Tenso
         classes = (time[:, None] > edges.to_numpy()[last]).sum(1)
         knowing[held_out] = bits_held_out(last * CLASSES + classes, actions, training, held_out, without)
         scored |= held_out
-    spread = [torch.zeros(mask.shape, dtype=torch.double) for _ in range(3)]
-    for values, whole in zip((without, knowing, scored), spread, strict=True):
-        whole[mask] = torch.from_numpy(values).double()
-    return (spread[0], spread[1]), spread[2] > 0
+    whole = torch.zeros(3, *mask.shape, dtype=torch.double)
+    whole[:, mask] = torch.from_numpy(np.stack([without, knowing, scored]))
+    return (whole[0], whole[1]), whole[2] > 0
 
 
 def dwell_times(plans: RecordedPlans, model: DurationModel) -> pd.DataFrame:

@@ -1,6 +1,6 @@
 """What a report found: findings with their tests, and the sentences at its top, made of these and no others."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -44,6 +44,16 @@ class Finding:
         found = asdict(self)
         del found["sentence"]
         return found
+
+
+def gain_finding(family: str, feature: str, what: str, row: Mapping[Any, Any]) -> Finding:
+    """The finding that `what` adds bits: of a row with `bits, low, high, p_value, corrected, starred`."""
+    bits, low, high, p, corrected = (float(row[name]) for name in ("bits", "low", "high", "p_value", "corrected"))
+    sentence = (
+        f"{what} adds {bits:.3g} bits to the prediction of the next one, 95 % interval {low:.3g} to {high:.3g};"
+        f" {p_words(corrected)}."
+    )
+    return Finding(feature, family, feature, bits, low, high, p, corrected, bool(row["starred"]), sentence)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import pandas as pd
@@ -20,7 +20,7 @@ from neuroprior.behaviour.reporting import figures
 from neuroprior.behaviour.reporting.conditions import condition_section
 from neuroprior.behaviour.reporting.document import Column, table
 from neuroprior.behaviour.reporting.durations import duration_section
-from neuroprior.behaviour.reporting.findings import Finding, p_words
+from neuroprior.behaviour.reporting.findings import Finding, gain_finding, p_words
 from neuroprior.behaviour.reporting.individuals import individual_section
 from neuroprior.behaviour.reporting.modes import mode_section
 from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
@@ -158,8 +158,12 @@ def lag_section(found: Evaluation) -> Part | None:
     findings, verdicts = list[Finding](), list[str]()
     if result is not None:
         frame = frames["how_far_back"] = result.frame()
-        findings = _lag_findings(frame, result.verdict)
-        verdicts = [] if result.few or findings[0].starred else [result.verdict]
+        for row in frame.assign(starred=frame["adds"]).to_dict("records"):
+            findings.append(gain_finding("lags", f"lag {row['lag']}", f"The behaviour {row['lag']} back", row))
+        if reach := int(frame["adds"].sum()):  # the last lag that adds is said with the verdict, before the others
+            last = findings.pop(reach - 1)
+            findings.insert(0, replace(last, sentence=f"{result.verdict} {last.sentence}"))
+        verdicts = [] if result.few or reach else [result.verdict]
         text += [without_verdict(result.few) or result.verdict]
         columns: dict[str, Column] = {
             "lag": "lag",
@@ -184,21 +188,6 @@ def lag_section(found: Evaluation) -> Part | None:
         caption = f"Bits that the action k steps back adds; intervals over {unit_name(found.first_fold)} of one fold."
         boxes = [FigureBox(figures.lag_figure(found.gains), caption, "Gain by lag.", "lags")]
     return Part(Section("How far back", text, tables, boxes), frames, verdicts, findings)
-
-
-def _lag_findings(frame: pd.DataFrame, verdict: str) -> list[Finding]:
-    """A finding for each lag; first the last one that adds, which is said with the verdict."""
-    found, reach = list[Finding](), int(frame["adds"].sum())
-    for row in frame.to_dict("records"):
-        gain, low, high, p, corrected = (float(row[what]) for what in ("bits", "low", "high", "p_value", "corrected"))
-        feature = f"lag {row['lag']}"
-        sentence = (
-            f"Lag {row['lag']} adds {gain:.2g} bits, 95 % interval {low:.2g} to {high:.2g}; {p_words(corrected)}."
-        )
-        if row["lag"] == reach:
-            sentence = f"{verdict} {sentence}"
-        found.append(Finding(feature, "lags", feature, gain, low, high, p, corrected, bool(row["adds"]), sentence))
-    return found[reach - 1 : reach] + found[: max(reach - 1, 0)] + found[reach:]
 
 
 def motif_section(found: Evaluation) -> Part | None:

@@ -40,23 +40,16 @@ def survival_findings(result: DurationSurvival, few: str, unit: str) -> list[Fin
     """
     found = []
     for name, (p, corrected) in result.tests.items():
-        medians = [
-            f"{curve.median:.3g}{f' {unit}' * bool(unit)} under {level}"
-            for (behaviour, level), curve in result.curves.items()
-            if behaviour == name
-        ]
-        effect = low = high = None
-        sentence = (
-            f"How long a bout of {name} lasts differs between conditions: medians {listed(medians)}; log-rank"
-            f" test, {p_words(corrected)}."
-        )
-        if name in result.ratios:
-            effect, low, high = result.ratios[name]
-            first, second = (level for behaviour, level in result.curves if behaviour == name)
-            sentence = (
-                f"Bouts of {name} last {effect:.3g} times as long under {second} as under {first}, 95 % interval"
-                f" {low:.3g} to {high:.3g}; log-rank test, {p_words(corrected)}."
-            )
+        curves = {level: curve for (behaviour, level), curve in result.curves.items() if behaviour == name}
+        effect, low, high = result.ratios.get(name, (None, None, None))
+        if effect is None:
+            medians = [f"{one.median:.3g}{f' {unit}' * bool(unit)} under {level}" for level, one in curves.items()]
+            sentence = f"How long a bout of {name} lasts differs between conditions: medians {listed(medians)}"
+        else:
+            first, second = curves
+            sentence = f"Bouts of {name} last {effect:.3g} times as long under {second} as under {first}"
+            sentence += f", 95 % interval {low:.3g} to {high:.3g}"
+        sentence += f"; log-rank test, {p_words(corrected)}."
         feature, starred = f"survival of {name}", corrected < LEVEL and not few
         estimate = (effect, low, high, p, corrected)
         found.append(Finding(f"survival: {name}", "survival", feature, *estimate, starred, sentence))
@@ -70,9 +63,7 @@ def survival_table(result: DurationSurvival, few: str) -> Table:
     columns |= {name.replace(", ", ",\n"): f"{name}:.3g" for name in frame.columns if name.startswith("median")}
     caption = "Medians of bouts, of which some were cut off by the end of watching (Kaplan-Meier)."
     if result.ratios:
-        columns["ratio"] = lambda row: (
-            "" if np.isnan(row.ratio) else f"{row.ratio:.3g} ({row.low:.3g} to {row.high:.3g})"
-        )
+        columns["ratio"] = lambda row: f"{row.ratio:.3g} ({row.low:.3g} to {row.high:.3g})"
         caption += " ratio: of restricted means, the second by the first, with its 95 % interval."
     if result.tests and not few:
         columns["p"] = lambda row: (

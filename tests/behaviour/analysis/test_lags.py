@@ -95,6 +95,9 @@ def test_lags_are_tested_in_their_order():
     assert some.verdict == "How far back: one behaviour; a second adds nothing (-.3 bits, -.4 to -.2)."
     every = HowFarBack(gains[::2], np.array([1e-5, 1e-5]), 2, "groups", 9, "")
     assert every.verdict == "How far back: two behaviours at least."
+    in_turn = how_far_back(Plans(torch.tensor([[0, 0], [0, 1], [1, 0], [1, 1]] * 10).repeat(1, 30), 2), 2)
+    assert in_turn.gains[1].mean > 0.9
+    assert (in_turn.reach, in_turn.corrected[1]) == (0, in_turn.corrected[0])
     none = HowFarBack(gains[1:], np.array([1.0, 1.0]), 0, "groups", 9, "")
     assert none.verdict == "How far back: no behaviour; the last adds nothing (-.3 bits, -.4 to -.2)."
 
@@ -106,6 +109,15 @@ def test_an_action_that_is_known_from_the_last_one():
     assert result.gains[0].mean == pytest.approx(math.log2(3), abs=0.01)
     assert result.gains[1].mean == pytest.approx(0, abs=1e-3)
     assert result.reach == 1
+
+
+def test_first_actions_may_be_left_out():
+    """A cycle in the first ten actions; what comes after them is random."""
+    cycle = (torch.arange(20)[:, None] + torch.arange(10)) % 3
+    plans = Plans(torch.cat([cycle, torch.randint(3, (20, 40), generator=seeded(0))], 1), 3)
+    whole, rest = how_far_back(plans, 1), how_far_back(plans, 1, skip=10)
+    assert whole.gains[0].mean > 0.03 > 0 > rest.gains[0].low
+    assert (whole.reach, rest.reach) == (1, 0)
 
 
 def test_what_is_not_there_is_seldom_found_and_what_is_there_is():

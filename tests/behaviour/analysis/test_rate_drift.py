@@ -7,8 +7,9 @@ import torch
 from scipy import optimize, stats
 
 from neuroprior import Plans
+from neuroprior._statistics import mean_interval
 from neuroprior.behaviour import RecordedPlans, Recordings, holm, rate_drift
-from neuroprior.behaviour.analysis.rate_drift import BINS, overlap
+from neuroprior.behaviour.analysis.rate_drift import BINS, _change, overlap
 from tests.support.sources import FALSE_ALARM, refuses, seeded
 
 
@@ -121,6 +122,13 @@ def test_no_drift_is_seldom_found(per):
     assert alarms <= stats.binom.isf(FALSE_ALARM, 100, 0.06)
 
 
+def test_of_equally_informed_units_the_interval_is_that_of_student():
+    values = np.array([-1.2, 0.3, -0.4, -2.1, 0.9, -0.6])
+    change = _change(values.mean(), 40 * (values - values.mean()), np.full(6, 40.0))
+    assert change[:3] == pytest.approx(mean_interval(values))
+    assert change.p_value == pytest.approx(stats.ttest_1samp(values, 0).pvalue)
+
+
 def test_spans_of_files_are_when_bouts_could_begin():
     """All bouts are early: nothing is known of later unless it was watched."""
     rows = [("1", s, "run", t) for s in "abc" for t in (1.0, 2.0 + ord(s) / 100, 4.0)]
@@ -141,6 +149,10 @@ def test_plans_are_by_order_whatever_their_fragments():
         recording=[f"day {day}" for day in range(8) for _ in range(2)],
     )  # fmt: skip
     assert rate_drift(cut).changes == rate_drift(whole).changes
+    padded = Plans(torch.nn.functional.pad(actions, (0, 20)), 3, torch.full((8,), 30), group=torch.arange(8) // 2)
+    assert rate_drift(padded).changes == rate_drift(whole).changes
+    mixed = rate_drift(whole[torch.tensor([5, 0, 7, 2, 4, 1, 3, 6])])
+    np.testing.assert_allclose(mixed.changes, rate_drift(whole).changes)
     assert (rate_drift(whole).unit, rate_drift(whole).num_units) == ("groups", 4)
     assert rate_drift(whole).bouts.tolist() == actions.flatten().bincount().tolist()
     late = torch.arange(40) >= 20

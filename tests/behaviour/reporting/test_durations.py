@@ -184,6 +184,9 @@ def test_no_duration_of_the_action_itself_or_later_is_used():
     (_, before), mask = chain_bits(plans, plans.mask())
     assert (mask.sum(1) == 59).all()
     assert not bool(mask[:, 0].any())
+    unknown = plans.durations.masked_fill(torch.rand(24, 60, generator=seeded(0)) < 0.2, nan)
+    (_, _), after_known = chain_bits(replace(plans, durations=unknown), ~unknown.isnan())
+    assert after_known.equal(torch.nn.functional.pad(~unknown[:, :-1].isnan(), (1, 0)))
     mine = plans.group == 0  # learned from the other group, which stays as it is
     for step in (1, 30, 59):
         durations = plans.durations.clone()
