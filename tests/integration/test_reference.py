@@ -83,6 +83,7 @@ WITHOUT_EXAMPLE = {
             "GaussianForecast",
             "GroupDrift",
             "HorizonRound",
+            "Individuality",
             "Individuals",
         ),
         *(

@@ -85,8 +85,9 @@ def individuality(source: RecordedPlans | Recordings) -> Individuality:
 
     Example:
         >>> actions = torch.tensor([[0, 1] * 20, [0, 1] * 20, [0, 0, 1, 1] * 10, [0, 1] * 20])
-        >>> individuality(RecordedPlans(actions, 2, group=torch.arange(4))).frame().saved.argmax()
-        2
+        >>> frame = individuality(RecordedPlans(actions, 2, group=torch.arange(4))).frame()
+        >>> frame.individual[frame.saved.argmax()]
+        'group 2'
     """
     plans = (source.plans() if isinstance(source, Recordings) else source).without_context()
     plans = plans[plans.mask().any(1)]
