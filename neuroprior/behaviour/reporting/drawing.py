@@ -208,7 +208,8 @@ def decades(axes: Axes, low: float, high: float) -> None:
     """Put three to six numbers on a logarithmic axis across, in plain digits."""
     span = np.log10(high / low)
     steps = (1, 2, 5) if span < 1.2 else (1, 3) if span < 2.2 else (1,)
-    axes.set_xlim(low, high)
+    if high > low:
+        axes.set_xlim(low, high)
     axes.xaxis.set_major_locator(LogLocator(subs=steps, numticks=6))
     axes.xaxis.set_major_formatter(DIGITS)
     axes.minorticks_off()
