@@ -83,8 +83,8 @@ def test_groups_and_conditions_have_tables_of_their_own(tmp_path, capsys):
         sums = [float(due[label == one].sum()) for one in label.unique()]
         assert frames[name]["log_likelihood"].tolist() == pytest.approx(sums, abs=1e-4)
     words = " ".join(capsys.readouterr().out.split())
-    assert "3 groups are too few for a verdict" in words
-    low, high = (float(word) for word in re.search(r"interval ([\d.]+) to ([\d.]+) over groups", words).groups())
+    assert "3 subjects are too few for a verdict" in words
+    low, high = (float(word) for word in re.search(r"interval ([\d.]+) to ([\d.]+) over subjects", words).groups())
     mean = float(re.search(r"([\d.]+) bits per action, 95", words).group(1))
     assert low < mean < high
     assert mean == pytest.approx(-float(due.sum()) / 45 / math.log(2), abs=1e-4)

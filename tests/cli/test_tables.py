@@ -36,7 +36,7 @@ def test_report_fit_and_score_read_it_alike(table, capsys):
     results = json.loads(Path("report/results.json").read_text())
     assert results["file"]["plans"] == 32
     assert (results["file"]["groups"], results["file"]["conditions"]) == (8, 2)
-    assert results["unit"] == "groups"
+    assert results["unit"] == "subjects"
     fit = ["fit", "lab.csv", "--config", "markov", "--held_out", "0.25", "--out", "prior"]
     assert main([*fit, *COLUMNS]) == 0
     assert load("prior").action_names == ("a", "b", "c")
@@ -53,7 +53,8 @@ def test_report_fit_and_score_read_it_alike(table, capsys):
     said = " ".join(capsys.readouterr().out.split())
     assert "Held-out scores" not in said
     assert "(training data)" in said
-    assert f"These are training data: prior has learned from {plans['training_data'].sum()} of the 32 plans." in said
+    learned = plans["training_data"].sum()
+    assert f"These are training data: prior has learned from {learned} of the 32 sequences." in said
 
 
 @pytest.mark.parametrize(

@@ -242,7 +242,7 @@ def test_ends_and_contexts_together(tmp_path):
 def test_units_are_named(tmp_path):
     folder = saved(UniformPrior(3), some_plans(), tmp_path / "prior")
     grouped = some_plans(group=torch.arange(60) // 20, group_names=("x", "y", "z"))
-    for name, plans, unit in (("a.npz", some_plans(), "plans"), ("b.csv", grouped, "groups")):
+    for name, plans, unit in (("a.npz", some_plans(), "sequences"), ("b.csv", grouped, "subjects")):
         write_plans(plans, tmp_path / name)
         made = report(tmp_path / name, priors=[folder], sections=["scores"])
         assert results_of(made)["unit"] == unit

@@ -63,7 +63,7 @@ def test_the_entropy_rate_is_reached(second_order):
     (row,) = (row for row in results["rows"] if row["model"] == "markov-1")
     assert row["more_low"] > 0
     assert results["reference"].startswith(best["model"])
-    assert results["unit"] == "plans"
+    assert results["unit"] == "sequences"
     assert results["file"] | {"name": ""} == {
         "name": "",
         "plans": 400,
@@ -109,7 +109,7 @@ def test_a_planted_difference_of_groups_is_found(tmp_path):
     group = torch.arange(4).repeat_interleave(20)
     plans = Plans(torch.cat(parts), 3, group=group, group_names=("<i>", "[/b]", "ü", "d"), action_names=("a", "b", "c"))
     results = report(plans, tmp_path, sections=["scores", "transitions"])
-    assert results["unit"] == "groups"
+    assert results["unit"] == "subjects"
     cells = [row for row in results["transitions"] if row["group"] != "all"]
     assert min(row["p_value"] for row in cells) == pytest.approx(0.001)
     (test,) = results["transition_test"]

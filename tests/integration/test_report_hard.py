@@ -63,7 +63,7 @@ def test_hard_files_have_a_report(what, tmp_path, recwarn):
     assert len(found) == 9
     lengths = plans.mask().sum(1) - closed
     assert results["file"]["actions"] == int(lengths.sum())
-    assert results["settings"].get("plans without actions, left out", 0) == int((lengths == 0).sum())
+    assert results["settings"].get("sequences without behaviours, left out", 0) == int((lengths == 0).sum())
     assert not [warning.message for warning in recwarn if "neuroprior" in str(warning.filename)]
 
 
@@ -135,7 +135,7 @@ def test_a_csv_file_of_names(tmp_path):
     (tmp_path / "new.csv").write_text("action_1,action_2,action_3,group\n" + "\n".join(rows) + "\n")
     assert main(["plans", str(tmp_path / "new.csv"), "--out", str(tmp_path / "out"), *QUICKLY, "--folds", "2"]) == 0
     results = json.loads((tmp_path / "out" / "results.json").read_text())
-    assert results["unit"] == "groups"
+    assert results["unit"] == "subjects"
     assert results["file"]["groups"] == 4
     assert results["file"]["actions"] == 24 * 2 + 8
     assert {row["name"] for row in results["drift"] if row["what"] == "group"} == {f"mouse {n}" for n in range(4)}

@@ -155,7 +155,7 @@ def test_each_kind_of_file(name, tmp_path, monkeypatch):
         name = str(tmp_path / name)
     assert main([*small(kind, tmp_path / "run"), name]) == 0
     report = metrics(tmp_path / "run")
-    assert report["unit"] == ("plans" if plans.group is None else "groups")
+    assert report["unit"] == ("sequences" if plans.group is None else "subjects")
     assert ("context" in report["rows"][-1]["context"]) == (plans.context is not None)
     assert load(tmp_path / "run").takes_context == (plans.context is not None)
     assert read_plans(tmp_path / "run" / "plans.npz").actions.shape == plans.actions.shape
@@ -268,7 +268,7 @@ def test_a_long_sequence_is_read_in_windows(tmp_path):
     write_plans(Plans((torch.arange(6000) // 3 % 4)[None], 4), tmp_path / "plans.npz")
     exactly = ["--window", "16", "--prior.dropout", "0", "--prior.lags", "16", "--max_steps", "120"]
     assert main([*small("gru", tmp_path / "run"), str(tmp_path / "plans.npz"), *exactly]) == 0
-    assert metrics(tmp_path / "run")["unit"] == "parts of the plan"
+    assert metrics(tmp_path / "run")["unit"] == "parts of the sequence"
     assert metrics(tmp_path / "run")["rows"][-1]["bits_per_action"] < 0.5
 
 

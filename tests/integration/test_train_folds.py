@@ -48,7 +48,7 @@ def test_each_group_is_held_out_once(tmp_path, capsys):
     assert all(words in printed for words in ("5 times more", "--folds 1", "60 held-out plans", "5 folds"))
     assert "*: best on the validation plans" in printed
     found = metrics(tmp_path / "run")
-    assert (found["folds"], found["unit"]) == (5, "groups")
+    assert (found["folds"], found["unit"]) == (5, "subjects")
     assert found["plans"] == {"training": 50, "validation": 10, "held_out": 60}
     rows = {row["model"]: row for row in found["rows"]}
     chosen = load(tmp_path / "run").config
@@ -67,7 +67,7 @@ def test_a_network_is_trained_with_the_same_settings_in_each_fold(tmp_path, caps
     plans = grouped(3)
     assert main(arguments_of(plans, tmp_path / "run", *GRU)) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "3 groups are too few for a verdict" in printed
+    assert "3 subjects are too few for a verdict" in printed
     assert "*" not in printed
 
     def fit(fold, training):

@@ -154,7 +154,9 @@ def never_taken(plans: Plans) -> str:
 
 
 def unit_name(plans: Plans, mask: Tensor | None = None) -> str:
-    """The kind of `units` that intervals are over: "groups", "plans", "plans of one group" or "parts of the plan".
+    """Return the kind of `units` that intervals are over.
+
+    "subjects" are groups; "sequences", "sequences of one subject" and "parts of the sequence" are of plans.
 
     Args:
         plans: the plans.
@@ -162,18 +164,18 @@ def unit_name(plans: Plans, mask: Tensor | None = None) -> str:
 
     Example:
         >>> unit_name(Plans(torch.zeros(4, 3, dtype=torch.long), 2, group=torch.tensor([0, 0, 1, 1])))
-        'groups'
+        'subjects'
     """
     taken = (plans.mask() if mask is None else mask).any(1)
     if plans.group is not None and len(plans.group.to(taken.device)[taken].unique()) >= FEWEST_UNITS:
-        return "groups"
+        return "subjects"
     if plans.group is not None and int(taken.sum()) >= FEWEST_UNITS:
-        return "plans of one group"
-    return "plans" if int(taken.sum()) >= FEWEST_UNITS else "parts of the plan"
+        return "sequences of one subject"
+    return "sequences" if int(taken.sum()) >= FEWEST_UNITS else "parts of the sequence"
 
 
 def too_few(plans: Plans, mask: Tensor | None = None, cut: bool = False) -> str:
-    """Why no verdict is drawn from plans, such as "3 groups are too few for a verdict"; "" where one may be.
+    """Why no verdict is drawn from plans, such as "3 subjects are too few for a verdict"; "" where one may be.
 
     Independent are groups; where there are none, plans. Plans of one group, and parts of one plan, are not.
 
@@ -184,9 +186,9 @@ def too_few(plans: Plans, mask: Tensor | None = None, cut: bool = False) -> str:
     """
     taken = (plans.mask() if mask is None else mask).any(1)
     if plans.group is not None:
-        what, number = "group", len(plans.group.to(taken.device)[taken].unique())
+        what, number = "subject", len(plans.group.to(taken.device)[taken].unique())
     else:
-        what, number = "plan", 1 if cut else int(taken.sum())
+        what, number = "sequence", 1 if cut else int(taken.sum())
     if number >= ENOUGH_UNITS:
         return ""
     return f"{number} {what}{'s' * (number != 1)} {'is' if number == 1 else 'are'} too few for a verdict"
@@ -297,11 +299,11 @@ def units(plans: Plans, mask: Tensor) -> Tensor:
         torch.Size([4, 3])
     """
     what = unit_name(plans, mask)
-    if what == "groups":
+    if what == "subjects":
         assert plans.group is not None
         unit: Tensor = plans.group.to(mask.device).unique(return_inverse=True)[1]
         return unit[:, None].expand(mask.shape)
-    if what.startswith("plans"):
+    if what.startswith("sequences"):
         taken = mask.any(1)
         return (taken.cumsum(0) - 1).clamp(min=0)[:, None].expand(mask.shape)
     place = mask.flatten().cumsum(0).view(mask.shape) - 1

@@ -56,7 +56,7 @@ class PlanDrift:
     A single plan is cut into `BLOCKS` parts, which take the place of plans (`item` is "parts").
 
     Attributes:
-        item: "plans" or "parts".
+        item: "sequences" or "parts".
         index: int64 `[K]`: the number of the plan (or part).
         group: int64 `[K]`: the number of its group; 0 without groups.
         bits, actions: float64 `[K]`: its bits per action, and how many actions count.
@@ -251,7 +251,7 @@ def _items(plans: Plans, counted: _Counted) -> tuple[str, Tensor, Tensor, Tensor
     group = torch.zeros(len(index), dtype=torch.long)
     if plans.group is not None:
         group = plans.group.cpu().long()[counted.plan[:1].expand(len(index)).cpu() if single else index.cpu()]
-    return "parts" if single else "plans", index.cpu(), group, totals, actions
+    return "parts" if single else "sequences", index.cpu(), group, totals, actions
 
 
 def _sums(values: Tensor, index: Tensor, num: int | None = None) -> Tensor:

@@ -40,7 +40,7 @@ class HowFarBack:
         corrected: float64 `[K]`: the p-value of a gain above `MIN_GAIN` at this lag and all before it. Lags are tested
             in their order, up to the first without a gain, so that no further correction is needed.
         reach: the last lag before the first whose corrected p-value is not below `LEVEL`.
-        unit: what intervals are over, such as "groups".
+        unit: what intervals are over, such as "subjects".
         num_units: how many there are.
         few: why no verdict is drawn; "" where one is.
     """
@@ -115,7 +115,7 @@ def how_far_back(plans: Plans, max_lag: int = 4, skip: int = 0) -> HowFarBack:
     mask = plans.mask().cpu()
     later = mask.clone()
     later[:, : max(1, skip)] = False
-    if len(units(plans, later)[later].unique()) < 2 or unit_name(plans, later) == "parts of the plan":
+    if len(units(plans, later)[later].unique()) < 2 or unit_name(plans, later) == "parts of the sequence":
         raise ValueError(f"`plans` must have two units with successive actions after the first {skip}, got fewer")
     actions, step, unit = actions_in_a_row(plans)
     fold = unit % MAX_FOLDS
@@ -229,7 +229,7 @@ def pieces(plans: Plans, length: int, most: int, generator: torch.Generator | No
     context = plans.context
     if context is not None:
         context = context[plan[:, None], step]
-    grouped = plans.group is not None and unit_name(plans, start_here) == "groups"
+    grouped = plans.group is not None and unit_name(plans, start_here) == "subjects"
     return Plans(
         plans.actions[plan[:, None], step],
         plans.num_actions,

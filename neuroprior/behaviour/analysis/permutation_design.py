@@ -35,7 +35,7 @@ class PermutationDesign:
 
     Attributes:
         kind: "between" or "within".
-        item: what the units are, "groups" or "plans".
+        item: what the units are, "subjects" or "sequences".
         conditions: int64 `[C]`: the numbers of the conditions, ascending.
         strata: int64 `[S]`: the numbers of the strata, ascending; 0 alone without strata.
         units: int64 `[G]`: the numbers of the groups, or of the plans, ascending.
@@ -83,7 +83,7 @@ class PermutationDesign:
             raise ValueError("`stratum` must be the same for all plans of a group, got several for one group")
         under = torch.zeros(len(numbers), len(conditions), dtype=torch.bool)
         under[unit, label] = True
-        item, notes = "plans" if plans.group is None else "groups", []
+        item, notes = "sequences" if plans.group is None else "subjects", []
         names = numbered_names(plans.condition_names, conditions, "condition")
 
         rare = under.sum(0) < MIN_UNITS
@@ -112,7 +112,7 @@ class PermutationDesign:
         odd = ""
         if kind == "within" and single.sum() > (~single).sum() and not _reason("between", item, under[single], names):
             several = numbers[~single].tolist()
-            groups = item == "groups" and plans.group_names
+            groups = item == "subjects" and plans.group_names
             odd = (
                 f"Under several conditions: {listed([groups[n] for n in several] if groups else several)}; the other"
                 f" {int(single.sum())} {item} are under one each. If that is a slip, mend the condition of their plans;"
@@ -210,11 +210,11 @@ def _strata(plans: RecordedPlans) -> Tensor:
 def _reason(kind: Kind, item: str, under: Tensor, names: list[str]) -> str:
     """Why the units, under the conditions `[G, C]`, cannot be tested; empty where they can."""
     if len(names) < 2:
-        return "all plans are under one condition"
+        return "all sequences are under one condition"
     if kind == "within":
         number = "none" if not len(under) else "only one"
         return "" if len(under) > 1 else f"of the {item}, {number} is under every condition; at least two are needed"
     if not len(under):
-        return "in each stratum all plans are under one condition"
+        return "in each stratum all sequences are under one condition"
     few = [name for name, units in zip(names, under.sum(0).tolist(), strict=True) if units < MIN_UNITS]
     return f"{few[0]} has one of the {item} only; at least two are needed for each condition" if few else ""

@@ -35,7 +35,7 @@ class RateDrift:
         changes: A: of the natural logarithm of the rate from the beginning to the end of a session, with its 95 %
             interval over units and the p-value of 0; without bounds where fewer than two units have the behaviour.
         corrected: float64 `[A]`: the p-values, corrected for the number of behaviours (Holm).
-        unit: what intervals are over, "subjects", "recordings", "groups" or "plans".
+        unit: what intervals are over, "subjects", "recordings" or "sequences".
         num_units: how many there are.
     """
 
@@ -176,7 +176,8 @@ def _count_in_order(plans: Plans) -> tuple[_Counts, str]:
     bouts = np.zeros((len(plans), plans.num_actions, BINS))
     np.add.at(bouts, tuple(index.cpu().numpy() for index in (plan, plans.actions[mask].long(), part)), 1)
     acted = mask.any(1).cpu().numpy()
-    of_plan = units(plans, mask)[:, :1].flatten().cpu().numpy() if unit != "parts of the plan" else np.zeros(len(plans))
+    alone = unit == "parts of the sequence"
+    of_plan = np.zeros(len(plans)) if alone else units(plans, mask)[:, :1].flatten().cpu().numpy()
     return _Counts(action_names(plans), bouts[acted], bouts[acted].sum(1), of_plan[acted].astype(np.int64)), unit
 
 

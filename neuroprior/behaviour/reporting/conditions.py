@@ -26,10 +26,10 @@ from neuroprior.plans.columns import listed
 DRAWN = 8  # features in the figure
 
 TESTS = {
-    "actions": "shares of actions",
+    "actions": "shares of behaviours",
     "transitions": "transition probabilities",
     "sequences": "shares of sequences of three",
-    "durations": "durations of actions",
+    "durations": "durations of behaviours",
     "bits": "bits saved by knowing the condition",
     "classifier": "condition predicted from sequences",
 }
@@ -151,7 +151,8 @@ def _prediction_findings(result: ConditionComparison, prediction: ConditionPredi
     mean, low, high, _ = prediction.gain
     right, expected = 100 * prediction.accuracy, 100 * prediction.expected
     item = result.design.item
-    saved = f"Knowing the condition saves {mean:.3g} bits per action, 95 % interval {low:.3g} to {high:.3g} over {item}"
+    interval = f"95 % interval {low:.3g} to {high:.3g} over {item}"
+    saved = f"Knowing the condition saves {mean:.3g} bits per behaviour, {interval}"
     told = f"From its sequences, {right:.0f} % of the {item} are given their own condition ({expected:.0f} % by chance)"
     found = []
     for name, effect, least, most, sentence in (
@@ -175,8 +176,8 @@ def _text(result: ConditionComparison) -> list[str]:
         how += f" They were permuted within {len(design.strata)} strata, whose differences do not count."
     return [
         result.verdict,
-        f"{how} Plans of one unit under one condition always stay together, so that it does not matter how alike they"
-        f" are. {'All' if result.exact else 'Random'} labellings that were compared, with the observed one:"
+        f"{how} Sequences of one unit under one condition always stay together, so that it does not matter how alike"
+        f" they are. {'All' if result.exact else 'Random'} labellings that were compared, with the observed one:"
         f" {' '.join([f'{result.labellings:,}.', *design.notes])}",
         "Families of features are tested by their most different feature (Westfall and Young); the tests are corrected"
         " for their number (step-down minP). Behaviour differs where one of them is significant. A star marks a feature"
@@ -186,10 +187,10 @@ def _text(result: ConditionComparison) -> list[str]:
 
 
 def _unit_names(result: ConditionComparison, found: Evaluation) -> list[str]:
-    if result.design.item == "plans":
+    if result.design.item == "sequences":
         names = found.plans.recording or ()
         distinct = len(set(names)) == len(found.plans)
-        return [names[number] if distinct else f"plan {number}" for number in result.design.units.tolist()]
+        return [names[number] if distinct else f"sequence {number}" for number in result.design.units.tolist()]
     return group_names(found.plans, result.design.units)
 
 
@@ -214,7 +215,7 @@ def _test_table(result: ConditionComparison, tests: pd.DataFrame) -> Table:
     caption = (
         f"Smallest possible p: {result.smallest_p:.2g}. *: p < 0.05, corrected for the {len(result.tests)} tests (the"
         " smallest p of all in each labelling: Westfall and Young). A Markov chain that knows the condition saves"
-        f" {mean:+.4f} bits per held-out action (95 % interval {low:+.4f} to {high:+.4f} over"
+        f" {mean:+.4f} bits per held-out behaviour (95 % interval {low:+.4f} to {high:+.4f} over"
         f" {result.design.item}; the test asks whether other labellings save as much, not whether this is above 0)."
     )
     return table(tests, columns, caption, "Do conditions differ?")

@@ -58,7 +58,7 @@ def duration_section(found: Evaluation) -> Part | None:
     bounds = f"±: 95 % intervals over {over}."
     of_all = f" The {LISTED} commonest of {len(frame)}." if len(frame) > LISTED else ""
     columns: dict[str, Column] = {
-        "action": "action",
+        "behaviour": "action",
         "known": "known:,",
         "unkn.": "unknown:,",
         "25 %": "quartile_1:.3g",
@@ -75,27 +75,27 @@ def duration_section(found: Evaluation) -> Part | None:
     )
     tables = [table(frame[:LISTED], columns, caption, "Durations", "lrrrrrrlr")]
     shown: dict[str, Column] = {"laws": "what", "nats per duration": _gain}
-    caption = "Over exponential laws of each action, and over laws of the line above: durations may depend on the next"
-    caption += f" action, too, where that predicts them better. {bounds}"
+    caption = "Over exponential laws of each behaviour, and over laws of the line above: durations may depend on the"
+    caption += f" next behaviour, too, where that predicts them better. {bounds}"
     tables.append(table(laws, shown, caption, "Laws of durations", "lr"))
     too_few_units = too_few(found.plans)
     if len(following):
         shown = {"model": "model", "without": "without:.4f", "with": "with:.4f", "gain": _gain}
-        caption = f"Bits per held-out action without and with the last duration known. {bounds}"
+        caption = f"Bits per held-out behaviour without and with the last duration known. {bounds}"
         if not too_few_units:
             shown["p"] = lambda row: p_text(row.corrected) + "*" * row.starred
             caption += " p: of a gain, corrected for the models (Holm). *: p < 0.05."
-        tables.append(table(following, shown, caption, "Whether durations predict the next action"))
+        tables.append(table(following, shown, caption, "Whether durations predict the next behaviour"))
     text = [
         "Exponential laws are those of a process without memory, in which a long stay says nothing of when it ends."
-        " Where another law predicts durations better, actions have typical lengths, or bursts and pauses.",
-        "Whether durations predict the next action: a chain of order 1 with back-off, and the same with how long the"
-        f" last action took, in {CLASSES} classes by its own action's terciles in the training plans. Where the gain is"
-        " above 0, durations carry information that a model of actions alone does not have.",
+        " Where another law predicts durations better, behaviours have typical lengths, or bursts and pauses.",
+        "Whether durations predict the next behaviour: a chain of order 1 with back-off, and the same with how long the"
+        f" last behaviour took, in {CLASSES} classes by its own terciles in the training sequences. Where the gain is"
+        " above 0, durations carry information that a model of behaviours alone does not have.",
         *([without_verdict(too_few_units)] if too_few_units else []),
     ]
     caption = "Density of the logarithm of durations above 0 (bars), and of the law that was fitted (line)."
-    boxes = [FigureBox(figures.dwell_figure(dwell), caption, "Dwell times of the actions with their laws.", "dwell")]
+    boxes = [FigureBox(figures.dwell_figure(dwell), caption, "Dwell times of the behaviours with their laws.", "dwell")]
     survival = duration_survival(found.plans, generator=torch.Generator().manual_seed(0))
     frames = {"durations": frame, "duration_laws": laws, "next_by_duration": following, "dwell": dwell}
     frames |= {"survival": survival.frame(), "survival_tests": survival.medians()}
@@ -178,8 +178,8 @@ def _laws(plans: RecordedPlans, known: Tensor, model: DurationModel, gains: dict
     """What laws of actions gain over exponential ones, and laws of transitions over those of actions."""
     number = len({row.action for row in model.table() if row.next_action is not None})
     names = {
-        "law": "the law of each action",
-        "transition": f"and of each transition (in {number} of {plans.num_actions} actions)",
+        "law": "the law of each behaviour",
+        "transition": f"and of each transition (in {number} of {plans.num_actions} behaviours)",
     }
     return pd.DataFrame([{"what": name} | _by_unit(gains[what], plans, known) for what, name in names.items()])
 

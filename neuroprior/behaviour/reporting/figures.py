@@ -108,7 +108,7 @@ def score_figure(scores: pd.DataFrame) -> Figure:
         values = ", ".join("" if np.isnan(bits) else f"{bits:.3f}" for bits in floats(own["bits_per_action"]))
         axes.text(1.03, y, values, transform=axes.get_yaxis_transform(), va="center")
     names_down(axes, [short(model, 36) for model in models])
-    axes.set_xlabel("bits per action (less is better)")
+    axes.set_xlabel("bits per behaviour (less is better)")
     axes.set_xlim(right=limit if np.isfinite(limit) else None)
     if many:
         legend(figure, [marker(INK, hollow, inputs, shape) for inputs, (shape, hollow) in styles.items()])
@@ -182,7 +182,7 @@ def dwell_figure(dwell: pd.DataFrame) -> Figure:
         axes.spines["left"].set_visible(False)
     at_edges(cells, len(shown), across, "duration", "density")
     if len(shown) < len(actions):
-        figure.suptitle(f"the {len(shown)} commonest of {len(actions)} actions", fontsize=10, x=0.01, ha="left")
+        figure.suptitle(f"the {len(shown)} commonest of {len(actions)} behaviours", fontsize=10, x=0.01, ha="left")
     return figure
 
 
@@ -205,7 +205,7 @@ def transition_figure(matrix: ArrayLike, names: Sequence[str], title: str = "", 
     for a, b in np.argwhere(np.isfinite(probs)) if numbered else []:
         axes.text(b, a, f"{probs[a, b]:.2f}", ha="center", va="center", fontsize=7.5 if small else 9)
     _named(axes, names, 7.5 if small or len(probs) > 20 else 10)
-    axes.set(xlabel="next action", ylabel="last action", title=clean(title))
+    axes.set(xlabel="next behaviour", ylabel="last behaviour", title=clean(title))
     if not small:
         _scale(axes, 0, top, PLAIN, "probability")
     return figure
@@ -250,9 +250,9 @@ def group_transition_figure(
             _named(axes, names, 8, left=number % across == 0, below=number >= len(chosen) - across)
         else:
             axes.set(xticks=[], yticks=[])
-    at_edges(cells, len(chosen), across, "next action", "last action")
+    at_edges(cells, len(chosen), across, "next behaviour", "last behaviour")
     if len(chosen) < len(gaps):
-        figure.suptitle(f"{len(chosen)} of {len(gaps)} groups: those that differ most", fontsize=10, x=0.01, ha="left")
+        figure.suptitle(f"the {len(chosen)} of {len(gaps)} that differ most", fontsize=10, x=0.01, ha="left")
     _scale(cells[: len(chosen)], -top, top, MORE, "difference in probability")
     return figure
 
@@ -391,9 +391,9 @@ def ethogram_figure(plans: Plans) -> Figure:
         axes.text(0, tops[row] - 2, short(name, 40), va="bottom", fontsize=9, weight="bold")
     axes.spines[["left", "top", "right"]].set_visible(False)
     axes.xaxis.set_major_locator(MaxNLocator(integer=plans.durations is None and not in_time, min_n_ticks=1))
-    across = "action of the plan" if plans.durations is None else "time, in the unit of the durations"
-    across = "time since the first action, in the unit of the recordings" if in_time else across
-    axes.set_xlabel(across + (f"; {len(some)} of {len(starts_row)} plans" if len(some) < len(starts_row) else ""))
+    across = "behaviour of the sequence" if plans.durations is None else "time, in the unit of the durations"
+    across = "time since the first behaviour, in the unit of the recordings" if in_time else across
+    axes.set_xlabel(across + (f"; {len(some)} of {len(starts_row)} sequences" if len(some) < len(starts_row) else ""))
     figure.legend(handles=keys, loc="outside lower left", ncols=columns, fontsize=9, handlelength=1, columnspacing=1.4)
     return figure
 
@@ -482,7 +482,7 @@ def _strip_colors(count: Any, names: Sequence[str]) -> tuple[Array, list[Patch],
     palette[kept, :3], palette[kept, 3] = [to_rgb(color) for color in STRIPS[: len(kept)]], 1
     keys = [Patch(color=STRIPS[place], label=short(names[action])) for place, action in enumerate(kept)]
     if len(kept) < len(names):
-        keys.append(Patch(color=OTHER, alpha=0.45, lw=0, label=f"{len(names) - len(kept)} other actions"))
+        keys.append(Patch(color=OTHER, alpha=0.45, lw=0, label=f"{len(names) - len(kept)} other behaviours"))
     return palette, keys, 6 if max(len(str(key.get_label())) for key in keys) <= 10 else 3
 
 
@@ -499,7 +499,7 @@ def occupancy_figure(occupancy: pd.DataFrame) -> Figure:
     for number, name in enumerate(names):
         own = occupancy[occupancy["mode"] == name]
         band(axes, own[["part", "share", "low", "high"]].to_numpy(float), STRIPS[number % len(STRIPS)], name, "-")
-    whole_numbers(axes, f"part of the plan, of {occupancy['part'].max()}", "share of the actions")
+    whole_numbers(axes, f"part of the sequence, of {occupancy['part'].max()}", "share of the behaviours")
     axes.set_ylim(bottom=0)
     legend(figure, axes.get_legend_handles_labels()[0])
     return figure
@@ -525,14 +525,14 @@ def drift_figure(drift: pd.DataFrame, plans: pd.DataFrame) -> Figure:
     below = lower.subplots()
     place = 100 * (np.arange(len(parts)) + 0.5) / max(len(parts), 1)
     band(within, parts.assign(place=place)[["place", "bits", "low", "high"]].to_numpy(), PLAIN, "", "-")
-    within.set(xlim=(0, 100), xlabel="place in the plan, %", ylabel="bits per action", title="within plans")
+    within.set(xlim=(0, 100), xlabel="place in the sequence, %", ylabel="bits per behaviour", title="within sequences")
     within.grid(axis="y")
     _cloud(between, floats(plans["index"]), floats(plans["bits"]))
     for at, row in enumerate(ranked.itertuples()):
         dot(below, at, (row.bits, row.low, row.high), PLAIN)
     names_down(below, [short(name) for name in ranked["name"]])
     of_all = f" ({len(ranked)} of {len(groups)})" if len(ranked) < len(groups) else ""
-    below.set(xlabel="bits per action", title="groups" + of_all)
+    below.set(xlabel="bits per behaviour", title="subjects" + of_all)
     return figure
 
 
@@ -545,9 +545,9 @@ def _cloud(axes: Axes, index: Array, bits: Array) -> None:
     parts = np.array_split(places, min(20, len(places))) if len(places) else []
     means = [bits[known & (index >= part[0]) & (index <= part[-1])].mean() for part in parts]
     axes.plot([part.mean() for part in parts], means, color=MORE, lw=2.2)
-    whole_numbers(axes, "number of the plan in its group", "")
+    whole_numbers(axes, "number of the sequence of its subject", "")
     of_all = f" ({len(some):,} of {len(index):,} drawn)" if len(some) < len(index) else ""
-    axes.set_title("from plan to plan" + of_all)
+    axes.set_title("from sequence to sequence" + of_all)
 
 
 def _evenly(number: int, most: int) -> list[int]:

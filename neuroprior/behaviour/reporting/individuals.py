@@ -74,7 +74,7 @@ def individual_section(found: Evaluation) -> Part | None:
     boxes = [
         FigureBox(
             budget_strips(budget, result),
-            "What each individual did, as shares of its actions, and how far it is from the others (95 % interval;"
+            "What each individual did, as shares of its behaviours, and how far it is from the others (95 % interval;"
             " grey: what is usual by chance).",
             "Strips of behaviours of each individual.",
             "individual_strips",
@@ -186,7 +186,7 @@ def budget_strips(budget: pd.DataFrame, result: Individuals) -> Figure:
     for color, behaviour in zip(colors, order, strict=False):
         left.barh(at, rows[behaviour], left=edge, height=0.8, color=color, lw=0)
         edge = edge + rows[behaviour].to_numpy()
-    left.set(xlim=(0, 1), xlabel="share of actions")
+    left.set(xlim=(0, 1), xlabel="share of behaviours")
     names_down(left, [short(str(name), 16) for name in rows.index], at)
     right.barh(at, result.by_chance, height=0.8, color=OTHER, alpha=0.25, lw=0)
     distance, low, high = result.from_others.T

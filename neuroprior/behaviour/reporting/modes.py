@@ -56,13 +56,13 @@ def mode_section(found: Evaluation) -> Part | None:
         " of the fewest bits."
     ]
     if choice.chosen == 1:
-        text.append("One mode predicts these plans as well as more do: there is no sign of hidden modes.")
+        text.append("One mode predicts these sequences as well as more do: there is no sign of hidden modes.")
         return Part(Section("Hidden modes", text, tables), frames)
     names = mode_names(choice.chosen)
     again = [name for name, one in zip(names, stable, strict=True) if one]
     text.append(
         f"Modes that come back in the priors of all folds: {', '.join(again) or 'none'}. Others may predict, but are"
-        " accidents of the plans that they were learned from, and should not be given names."
+        " accidents of the sequences that they were learned from, and should not be given names."
     )
     described = mode_table(prior, plans).assign(stable=["yes" if one else "no" for one in stable])
     columns: dict[str, Column] = {
@@ -75,8 +75,8 @@ def mode_section(found: Evaluation) -> Part | None:
     }
     columns |= {side: side for side in ("enters", "leaves") if side in described}
     caption = (
-        "%: of the actions. dwell: actions in the mode for each end of it, visits: of a plan, both expected."
-        " actions: those that it takes more often than all modes together, with their shares in the mode."
+        "%: of the behaviours. dwell: behaviours in the mode for each end of it, visits: of a sequence, both expected."
+        " behaviours: those that it takes more often than all modes together, with their shares in the mode."
         + " enters, leaves: the commonest contexts."
         * ("enters" in described)
     )
@@ -92,12 +92,12 @@ def mode_section(found: Evaluation) -> Part | None:
             table(typical, shown, caption, "Over-represented sequences of each mode", "rl" + "r" * (len(shown) - 2))
         )
     own = mode_plans(prior, plans)
-    caption = "Each row a plan, each colour the most probable mode."
+    caption = "Each row a sequence, each colour the most probable mode."
     boxes.append(
         FigureBox(figures.ethogram_figure(own), caption, "Modes as coloured strips over time.", "mode_ethogram")
     )
     occupied = _occupancy(prior, plans)
-    caption = f"The share of the actions in each mode, by tenths of the plans. 95 % intervals over {found.unit}."
+    caption = f"The share of the behaviours in each mode, by tenths of the sequences. 95 % intervals over {found.unit}."
     boxes.append(
         FigureBox(figures.occupancy_figure(occupied), caption, "Shares of the modes over time.", "mode_occupancy")
     )
@@ -108,7 +108,8 @@ def mode_section(found: Evaluation) -> Part | None:
         each, pooled, action_names(plans), names, torch.zeros_like(each, dtype=torch.bool)
     )
     caption = (
-        "Each mode's probabilities of the next action (column) after the last one (row), less those of all actions."
+        "Each mode's probabilities of the next behaviour (column) after the last one (row), less those of all"
+        " behaviours."
     )
     boxes.append(FigureBox(figure, caption, "Differences of the modes' transitions.", "mode_transitions"))
     frames |= {
@@ -136,7 +137,7 @@ def choice_table(choice: ModeChoice) -> Table:
     """What speaks for each number of modes."""
     columns: dict[str, Column] = {
         "modes": "modes",
-        "bits per action": "bits:.3f",
+        "bits per behaviour": "bits:.3f",
         "more": "more:.4f",
         "error": "error:.4f",
     }

@@ -227,7 +227,7 @@ def _cross_validate(
     def evaluated(done: list[Job]) -> Evaluation:
         found = evaluate(learned, other, design, done, run.results(done))
         more: dict[str, Any] = {} if fits.modes is None else {"modes": sorted(set(fits.modes))}
-        more |= {"plans without actions, left out": empty} if empty else {}
+        more |= {"sequences without behaviours, left out": empty} if empty else {}
         more |= {} if test is None else {"test": _name(test)}
         return replace(found, plans=whole, settings=settings | found.settings | more)
 
@@ -323,7 +323,7 @@ def _scored(found: Evaluation) -> list[str]:
         return []
     learned = found.settings.get("training data", {})
     same = "; ".join(
-        f"{name} has learned from {number:,} of the {len(found.plans):,} plans" for name, number in learned.items()
+        f"{name} has learned from {number:,} of the {len(found.plans):,} sequences" for name, number in learned.items()
     )
     return [f"{_best(found)} These are training data: {same}." if learned else _best(found)]
 
@@ -332,8 +332,8 @@ def _best(found: Evaluation) -> str:
     bits, low, high, _ = found.best.score.bits_per_action()
     interval = f"(95 % interval {low:.3f} to {high:.3f} over {found.unit})"
     if not found.too_few:
-        return f"The best model, {found.best.label}, takes {bits:.3f} bits per action {interval}."
-    fewest = "the fewest bits per action of all models, " if len(found.models) > 1 else "bits per action: "
+        return f"The best model, {found.best.label}, takes {bits:.3f} bits per behaviour {interval}."
+    fewest = "the fewest bits per behaviour of all models, " if len(found.models) > 1 else "bits per behaviour: "
     return f"{found.best.label} takes {fewest}{bits:.3f} {interval}; {found.too_few}."
 
 

@@ -90,7 +90,7 @@ class Evaluation:
     @property
     def unit(self) -> str:
         """What intervals go over."""
-        return "parts of the plan" if self.settings.get("cut") else unit_name(self.scored, self.mask)
+        return "parts of the sequence" if self.settings.get("cut") else unit_name(self.scored, self.mask)
 
     @property
     def too_few(self) -> str:

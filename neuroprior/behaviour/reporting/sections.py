@@ -37,29 +37,30 @@ BEGINNING = 5  # actions of a plan that do not count in drift
 def file_section(found: Evaluation) -> Part:
     """What was read: how many plans of which kind, the commonest of their actions, and the plans over time."""
     plans, frame = found.plans, action_frame(found.plans)
-    columns = {"plans": "plans:,", "actions": "actions:,", "shortest": "shortest", "longest": "longest"}
-    columns |= {"kinds of\nactions": "kinds of actions", "groups": "groups", "context": "context"}
+    columns = {"sequences": "plans:,", "behaviours": "actions:,", "shortest": "shortest", "longest": "longest"}
+    columns |= {"kinds of\nbehaviour": "kinds of actions", "subjects": "groups", "context": "context"}
     columns |= {"conditions": "conditions"} if plans.condition is not None else {}
     notes = "".join(f"{note[:1].upper()}{note[1:]}. " for note in plans.notes).strip()
-    described = table(pd.DataFrame([describe(plans)]), columns, notes, "Plans", "rrrrrrl" + "r" * (len(columns) - 7))
+    align = "rrrrrrl" + "r" * (len(columns) - 7)
+    described = table(pd.DataFrame([describe(plans)]), columns, notes, "The study", align)
     counted: dict[str, Column] = {
-        "action": "action",
+        "behaviour": "action",
         "count": "count:,",
         "%": lambda row: f"{100 * row.share:.1f}",
-        "plans": "plans:,",
+        "sequences": "plans:,",
     }
     if plans.durations is not None:
         counted |= {"median duration": "median_duration:.3g"}
     caption = f"The {LISTED} commonest of {len(frame)}." if len(frame) > LISTED else ""
     never = never_occur(plans.actions[plans.mask()].unique().cpu().numpy(), plans.num_actions, plans.action_names)
     caption = f"{caption} {never[:1].upper()}{never[1:]}.".strip() if never else caption
-    tables, boxes = [described, table(frame[:LISTED], counted, caption, "Actions")], []
+    tables, boxes = [described, table(frame[:LISTED], counted, caption, "Behaviours")], []
     if len(frame):
-        caption = "Each row a plan, each colour an action" + (", by group" if plans.group is not None else "")
+        caption = "Each row a sequence, each colour a behaviour" + (", by subject" if plans.group is not None else "")
         caption += (" and condition" if plans.condition is not None else "") + "."
-        alt = "The plans as rows of coloured strips over time."
+        alt = "The sequences as rows of coloured strips over time."
         boxes = [FigureBox(figures.ethogram_figure(plans), caption, alt, "ethogram")]
-    return Part(Section("Plans", tables=tables, figures=boxes), {"actions": frame})
+    return Part(Section("The study", tables=tables, figures=boxes), {"actions": frame})
 
 
 def action_frame(plans: RecordedPlans) -> pd.DataFrame:
@@ -84,7 +85,7 @@ def describe(plans: RecordedPlans) -> dict[str, Any]:
     if plans.context is not None:
         kind = "features" if plans.context.is_floating_point() else f"{_num_contexts(plans)} contexts"
         kind = "patterns" if has_patterns(plans.context) else kind
-        context = f"{kind}, {'at each step' if constant_context(plans) is None else 'once a plan'}"
+        context = f"{kind}, {'at each step' if constant_context(plans) is None else 'once a sequence'}"
     return {
         "plans": len(plans),
         "actions": int(lengths.sum()),
@@ -110,32 +111,32 @@ def score_section(found: Evaluation) -> Part | None:
         "model": lambda row: f"{row.model} (training data)" if row.model in learned else str(row.model),
         "input": _input,
         "nats": "nats_per_action:.4f",
-        "bits per\naction": lambda row: f"{row.bits_per_action:.4f}±{row.high - row.bits_per_action:.4f}",
+        "bits per\nbehaviour": lambda row: f"{row.bits_per_action:.4f}±{row.high - row.bits_per_action:.4f}",
         "perpl.": "perplexity:.3f",
         "more bits": lambda row: "" if pd.isna(row.more) else f"{row.more:+.4f}±{more[row.name]:.4f}",
     }
     caption = (
-        f"{'' if saved else 'On held-out actions. '}±: 95 % intervals over {found.unit}. more bits: the difference from"
-        f" {found.reference[1]}, paired."
+        f"{'' if saved else 'On held-out behaviours. '}±: 95 % intervals over {found.unit}. more bits: the difference"
+        f" from {found.reference[1]}, paired."
     )
     never = never_taken(found.plans) if any(model.name == "uniform" for model in found.models) else ""
     caption += f" {never[:1].upper()}{never[1:]}." if never else ""
     if learned:
-        same = "; ".join(f"{number:,} of {len(found.plans):,} plans for {name}" for name, number in learned.items())
-        caption += f" Training data: plans that the prior has learned from, at least in part ({same})."
-    held_out = "" if saved else " for actions that it has not learned from"
+        same = "; ".join(f"{number:,} of {len(found.plans):,} sequences for {name}" for name, number in learned.items())
+        caption += f" Training data: sequences that the prior has learned from, at least in part ({same})."
+    held_out = "" if saved else " for behaviours that it has not learned from"
     text = [
         f"The bits of each model{held_out}: the fewer, the more of the structure it predicts; a nat is 1.44 bits."
-        " Perplexity (perpl.) is the number of equally likely actions that would take as many bits.",
-        "Order, back-off and smoothing of count-based models were chosen within the training plans. The reference is"
-        " the model with the fewest bits on the same plans, which favours it a little; differences are not corrected"
-        " for the number of models.",
+        " Perplexity (perpl.) is the number of equally likely behaviours that would take as many bits.",
+        "Order, back-off and smoothing of count-based models were chosen within the training sequences. The reference"
+        " is the model with the fewest bits on the same sequences, which favours it a little; differences are not"
+        " corrected for the number of models.",
     ]
     text = text[:1] if saved else text
     text.append(without_verdict(found.too_few) or "A difference whose interval holds 0 is not significant.")
-    caption_of_figure = f"Bits per {'' if saved else 'held-out '}action, 95 % intervals over {found.unit}."
+    caption_of_figure = f"Bits per {'' if saved else 'held-out '}behaviour, 95 % intervals over {found.unit}."
     best = found.best
-    alt = f"Bits per action of each model, the fewest {best.cost:.3f} of {best.label}."
+    alt = f"Bits per behaviour of each model, the fewest {best.cost:.3f} of {best.label}."
     box = FigureBox(figures.score_figure(scores), caption_of_figure, alt, "scores")
     title = "Scores" if saved else "Held-out scores"
     shown = table(scores, columns, caption, align="llrrrr")
@@ -152,8 +153,9 @@ def lag_section(found: Evaluation) -> Part | None:
         return None
     frames, tables, boxes = {"how_far_back": pd.DataFrame(), "lags": found.gains}, list[Table](), list[FigureBox]()
     text = [
-        "Gain: how much the action k steps back improves predictions beyond all nearer ones. A Markov chain that knows"
-        " k actions is compared with one that knows k - 1, on actions of those whose others it learned from."
+        "Gain: how much the behaviour k steps back improves predictions beyond all nearer ones. A Markov chain that"
+        " knows k behaviours is compared with one that knows k - 1, on behaviours of those whose others it learned"
+        " from."
     ]
     findings, verdicts = list[Finding](), list[str]()
     if result is not None:
@@ -171,7 +173,7 @@ def lag_section(found: Evaluation) -> Part | None:
             "95 % interval": lambda row: f"{row.low:.4f} to {row.high:.4f}",
             "p": lambda row: p_text(row.corrected) + "*" * row.adds,
         }
-        caption = f"Bits that the action k steps back adds, over {result.unit}."
+        caption = f"Bits that the behaviour k steps back adds, over {result.unit}."
         caption += "" if result.few else " p: of a gain at this lag and all before it. *: p < 0.05."
         tables.append(table(frame, _without_p(columns, result.few), caption, "How far back"))
     if len(found.gains):
@@ -180,12 +182,14 @@ def lag_section(found: Evaluation) -> Part | None:
         wide = wide[wide.index.isin(LISTED_LAGS)].reset_index()
         names = {name.replace(", ", "\n").replace("with context", "+ context"): name for name in wide.columns}
         text.append(
-            "Longer lags, in held-out plans of the first fold alone: of chains, and of a GRU that was trained on pieces"
-            " of plans. Where the gain of the chain ends before that of the GRU, longer histories matter but occur too"
-            " seldom to be counted; below 0, splitting the counts loses more than the older action adds."
+            "Longer lags, in held-out sequences of the first fold alone: of chains, and of a GRU that was trained on"
+            " pieces of sequences. Where the gain of the chain ends before that of the GRU, longer histories matter"
+            " but occur too seldom to be counted; below 0, splitting the counts loses more than the older behaviour"
+            " adds."
         )
         tables.append(table(wide, names, "Bits. Not tested: one fold is too little.", "Gain by lag"))
-        caption = f"Bits that the action k steps back adds; intervals over {unit_name(found.first_fold)} of one fold."
+        over = f"intervals over {unit_name(found.first_fold)} of one fold"
+        caption = f"Bits that the behaviour k steps back adds; {over}."
         boxes = [FigureBox(figures.lag_figure(found.gains), caption, "Gain by lag.", "lags")]
     return Part(Section("How far back", text, tables, boxes), frames, verdicts, findings)
 
@@ -209,10 +213,10 @@ def motif_section(found: Evaluation) -> Part | None:
     }
     few = too_few(plans)
     text = [
-        "Sequences of three to six actions that occur more (or less) often than their parts predict: than under a chain"
-        " fitted to how often the sequence without its first, and without its last action occurs. All plans are taken"
-        " to be of one chain: where groups differ, sequences of some of them are over-represented, too. One such"
-        " sequence makes others over-represented that share its beginning.",
+        "Sequences of three to six behaviours that occur more (or less) often than their parts predict: than under a"
+        " chain fitted to how often the sequence without its first, and without its last behaviour occurs. All"
+        " sequences are taken to be of one chain: where subjects differ, sequences of some of them are"
+        " over-represented, too. One such sequence makes others over-represented that share its beginning.",
         *([] if len(frame) else ["There are none (p < 0.05, corrected for all sequences)."]),
         *([without_verdict(few)] if few else []),
     ]
@@ -243,21 +247,22 @@ def drift_section(found: Evaluation) -> Part | None:
     drift = pd.DataFrame(rows, columns=["what", "name", "bits", "low", "high"])
     own = pd.DataFrame({"group": plans.group.tolist(), "bits": plans.bits.tolist()})
     own = own.assign(index=own.groupby("group").cumcount() + 1)
-    tests: list[dict[str, Any]] = [{"test": "change over a plan, bits"} | within.trend._asdict()]
+    tests: list[dict[str, Any]] = [{"test": "change over a sequence, bits"} | within.trend._asdict()]
     if plans.trend is not None:
         tests.append({"test": f"rank correlation from {plans.item[:-1]} to {plans.item[:-1]}"} | plans.trend._asdict())
     if groups.p_value is not None:
-        tests.append({"test": "groups are alike (Kruskal and Wallis)", "p_value": groups.p_value})
+        tests.append({"test": "subjects are alike (Kruskal and Wallis)", "p_value": groups.p_value})
     tests_frame = pd.DataFrame(tests, columns=["test", "mean", "low", "high", "p_value"])
     text = [
-        "Bits per held-out action of the best model: where behaviour changes, plans get harder (or easier) to predict.",
+        "Bits per held-out behaviour of the best model: where behaviour changes, sequences get harder (or easier) to"
+        " predict.",
         (
-            f"The first {BEGINNING} actions of each plan do not count here: little stands before them."
+            f"The first {BEGINNING} behaviours of each sequence do not count here: little stands before them."
             if mask is not found.mask
-            else "Plans are too short to leave out their first actions. Little stands before these, so that they cost"
-            " more, which alone is a change over a plan."
+            else "Sequences are too short to leave out their first behaviours. Little stands before these, so that they"
+            " cost more, which alone is a change over a sequence."
         ),
-        *(["The only plan was cut into consecutive parts, which stand for plans."] * bool(found.settings.get("cut"))),
+        *(["The only sequence was cut into parts, which stand for sequences."] * bool(found.settings.get("cut"))),
         *([without_verdict(found.too_few)] if found.too_few else []),
     ]
     columns: Mapping[str, Column] = {
@@ -268,8 +273,9 @@ def drift_section(found: Evaluation) -> Part | None:
     }
     caption = f"Bits of {model.label}; intervals over {found.unit}."
     tables = [table(tests_frame, _without_p(columns, found.too_few), caption)]
-    caption = f"Bits per action of {model.label}. 95 % intervals over {found.unit}; of groups, over the plans of each."
-    box = FigureBox(figures.drift_figure(drift, own), caption, "Bits per action by place, plan and group.", "drift")
+    caption = f"Bits per behaviour of {model.label}. Intervals (95 %) over {found.unit}; of subjects, over sequences."
+    alt = "Bits per behaviour by place, sequence and subject."
+    box = FigureBox(figures.drift_figure(drift, own), caption, alt, "drift")
     frames = {"drift": drift, "drift_tests": tests_frame, "rate_drift": pd.DataFrame()}
     with suppress(ValueError):  # a single recording
         rates = _rates(found)

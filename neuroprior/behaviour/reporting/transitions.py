@@ -28,7 +28,7 @@ def transition_section(found: Evaluation) -> Part | None:
     names, probs = result.action_names, result.probs()
     frame = result.frame()
     frames = {"transitions": frame, "transition_test": pd.DataFrame()}
-    text = ["The probability of each action after each other one, within plans."]
+    text = ["The probability of each behaviour after each other one, within sequences."]
     shown = frame[frame["group"] == "all"].sort_values("count", ascending=False, kind="stable")[:LISTED]
     columns: dict[str, Column] = {
         "transition": lambda row: f"{row['from']} → {row['to']}",
@@ -36,13 +36,13 @@ def transition_section(found: Evaluation) -> Part | None:
         "probability": "probability:.3f",
         "95 % interval": lambda row: "" if pd.isna(row.low) else f"{row.low:.3f} to {row.high:.3f}",
     }
-    over = "groups" if len(result.groups) > 1 else "plans"
+    over = "subjects" if len(result.groups) > 1 else "sequences"
     tables = [table(shown, columns, f"The commonest; intervals over {over}.", "Transitions")]
-    caption = "The probability of each action (column) after each action (row)."
+    caption = "The probability of each behaviour (column) after each behaviour (row)."
     boxes = [FigureBox(transition_figure(probs, names), caption, "Transition matrix.", "transitions")]
     if len(names) <= MOST_NODES:
         caption = (
-            "Transitions above chance: arrows whose 95 % interval lies above the share of their second action among"
+            "Transitions above chance: arrows whose 95 % interval lies above the share of their second behaviour among"
             " all that follow another one. The wider an arrow, the more probable; the larger a circle, the more"
             " frequent."
         )
@@ -66,11 +66,11 @@ def transition_section(found: Evaluation) -> Part | None:
         row = {"groups": len(result.groups), "test": result.test, "permutations": result.permutations}
         test = pd.DataFrame([row | {"statistic": result.statistic, "p_value": result.p_value}])
         frames["transition_test"] = test
-        text.append(without_verdict(few) or "That groups have the same transitions is tested by permuting plans.")
+        text.append(without_verdict(few) or "That subjects have the same transitions is tested by permuting sequences.")
         if not few:
-            columns = {"groups": "groups", "permutations": "permutations:,", "p": "p_value:.2g"}
-            caption = "Whether groups have the same transitions (p: blank if not tested)."
-            tables.append(table(test, columns, caption, "Do groups differ?", align="rrr"))
+            columns = {"subjects": "groups", "permutations": "permutations:,", "p": "p_value:.2g"}
+            caption = "Whether subjects have the same transitions (p: blank if not tested)."
+            tables.append(table(test, columns, caption, "Do subjects differ?", align="rrr"))
     return Part(Section("Transitions", text, tables, boxes), frames, graphs={"transition_graph": result.graph()})
 
 

@@ -136,19 +136,19 @@ def units(plans: Plans) -> list[int]:
 
 
 def test_units():
-    assert unit_name(held_out()) == "plans"
+    assert unit_name(held_out()) == "sequences"
     assert units(held_out()) == [7, 3, 5, 1, 2, 6, 4, 7, 3, 2]
     group = torch.tensor([5, 5, 9, 9, 5, -2, -2, 5, 7, 7, 7, -2])
-    assert unit_name(held_out(group=group)) == "groups"
+    assert unit_name(held_out(group=group)) == "subjects"
     # Ascending by number: -2, 5, 7; group 9 has no actions and does not count.
     assert units(held_out(group=group)) == [1 + 2 + 2, 7 + 3 + 5 + 6, 4 + 7 + 3]
 
 
 def test_groups_without_actions_do_not_count():
     two = torch.tensor([1, 1, 2, 2, 1, 1, 1, 1, 1, 1, 1, 1])  # the second has no actions
-    assert unit_name(held_out(group=two)) == "plans of one group"
+    assert unit_name(held_out(group=two)) == "sequences of one subject"
     assert units(held_out(group=two)) == units(held_out())
-    assert unit_name(held_out(group=torch.zeros(12).long())) == "plans of one group"
+    assert unit_name(held_out(group=torch.zeros(12).long())) == "sequences of one subject"
 
 
 @pytest.mark.parametrize("group", [None, torch.tensor([3, 3, 4])])
@@ -156,7 +156,7 @@ def test_groups_without_actions_do_not_count():
 def test_a_single_plan_is_cut_in_parts(length, group):
     """Also where the others have no actions: consecutive parts, whose sizes differ by one action at most."""
     plans = Plans(torch.arange(3 * length).view(3, length) % 3, 3, torch.tensor([0, length, 0]), group=group)
-    assert unit_name(plans) == "parts of the plan"
+    assert unit_name(plans) == "parts of the sequence"
     found = units(plans)
     assert sum(found) == length
     assert len(found) == min(BLOCKS, length)
@@ -328,11 +328,11 @@ def test_baselines_of_closed_plans_know_the_end():
     ("number", "group", "cut", "says"),
     [
         (5, None, False, ""),
-        (4, None, False, "4 plans are too few for a verdict"),
-        (20, torch.arange(20) % 4, False, "4 groups are too few for a verdict"),
+        (4, None, False, "4 sequences are too few for a verdict"),
+        (20, torch.arange(20) % 4, False, "4 subjects are too few for a verdict"),
         (20, torch.arange(20) % 5 * 7, False, ""),
-        (20, torch.zeros(20, dtype=torch.long), False, "1 group is too few for a verdict"),
-        (40, None, True, "1 plan is too few for a verdict"),
+        (20, torch.zeros(20, dtype=torch.long), False, "1 subject is too few for a verdict"),
+        (40, None, True, "1 sequence is too few for a verdict"),
     ],
 )
 def test_how_many_are_too_few(number, group, cut, says):
@@ -344,7 +344,7 @@ def test_only_units_that_count_are_counted():
     plans = Plans(torch.zeros(20, 3, dtype=torch.long), 2, group=torch.arange(20) // 4)
     mask = plans.mask()
     mask[:4] = False
-    assert too_few(plans, mask) == "4 groups are too few for a verdict"
+    assert too_few(plans, mask) == "4 subjects are too few for a verdict"
 
 
 def test_scores_that_are_equal_but_for_rounding_do_not_differ():

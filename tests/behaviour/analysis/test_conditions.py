@@ -294,7 +294,7 @@ def test_all_labellings_are_compared_where_they_are_no_more(permutations, labell
     found = compare_conditions(study(0, between(8)), permutations, seeded(0))
     assert (found.labellings, found.exact, found.smallest_p) == (labellings, labellings == 70, pytest.approx(smallest))
     assert found.conclusive
-    assert f"With 4 against 4 groups the smallest possible p is {smallest:.2g}" in found.verdict
+    assert f"With 4 against 4 subjects the smallest possible p is {smallest:.2g}" in found.verdict
 
 
 def test_four_against_four_can_show_a_large_difference():
@@ -312,22 +312,22 @@ def test_four_against_four_can_show_a_large_difference():
 def test_with_too_few_there_is_no_verdict():
     found = compare_conditions(study(0, between(4), slower={0: 100.0}, habit=0.1))
     assert found.smallest_p == pytest.approx(2 / 6)
-    assert found.verdict == "With 2 against 2 groups the smallest possible p is 0.33: no test can find a difference."
+    assert found.verdict == "With 2 against 2 subjects the smallest possible p is 0.33: no test can find a difference."
     assert not any(found.significant(family).any() for family in found.families)
     # Three animals under three conditions have enough permutations, but are too few.
     found = compare_conditions(study(0, within(3, 3, 3)))
     assert found.smallest_p == pytest.approx(6 / 6**3)
-    assert found.verdict == "3 groups under every condition are too few for a verdict."
+    assert found.verdict == "3 subjects under every condition are too few for a verdict."
     assert not found.conclusive
 
 
 @pytest.mark.parametrize(
     ("conditions", "why"),
     [
-        ([[0, 0], [0], [0]], "Not tested: all plans are under one condition."),
-        ([[0], [0], [0], [1, 1]], "drug 1 has one of the groups only"),
-        ([[0, 1, 0, 1]], "of the groups, only one is under every condition"),
-        ([[0, 1], [1, 2], [0, 2]], "of the groups, none is under every condition"),
+        ([[0, 0], [0], [0]], "Not tested: all sequences are under one condition."),
+        ([[0], [0], [0], [1, 1]], "drug 1 has one of the subjects only"),
+        ([[0, 1, 0, 1]], "of the subjects, only one is under every condition"),
+        ([[0, 1], [1, 2], [0, 2]], "of the subjects, none is under every condition"),
     ],
 )
 def test_what_cannot_be_tested_says_why(conditions, why):
@@ -462,8 +462,10 @@ def test_slips_in_conditions_are_named(slips):
     plans = study(12, conditions)
     found = compare_conditions(replace(plans, group_names=[f"m{n}" for n in range(12)]))
     names = ", ".join(f"m{animal}" for animal in slips)
-    assert f"Under several conditions: {names}; the other {12 - len(slips)} groups are under one each." in found.verdict
-    assert "mend the condition of their plans" in found.verdict
+    assert (
+        f"Under several conditions: {names}; the other {12 - len(slips)} subjects are under one each." in found.verdict
+    )
+    assert "mend the condition of their sequences" in found.verdict
     assert f"conditions: {', '.join(map(str, slips))};" in compare_conditions(plans).verdict
     # What is advised helps: the others can be compared.
     others = compare_conditions(plans[~torch.isin(plans.group, torch.tensor(slips))], 99)
@@ -490,9 +492,9 @@ def test_conditions_are_named_by_their_numbers():
 def test_without_groups_plans_are_the_units():
     plans = study(10, between(12, 1))
     found = compare_conditions(replace(plans, group=None))
-    assert found.design.item == "plans"
+    assert found.design.item == "sequences"
     assert found.tests == compare_conditions(plans).tests
-    assert "6 against 6 plans" in found.verdict
+    assert "6 against 6 sequences" in found.verdict
 
 
 def test_plans_without_actions_and_actions_that_an_animal_never_takes():

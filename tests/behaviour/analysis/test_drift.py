@@ -123,7 +123,7 @@ def test_plans_in_order_within_their_groups():
     plans = plans_of(8, 3, group=group, lengths=torch.tensor([3, 3, 1, 2, 3, 3, 3, 0]))
     bits = torch.tensor([5.0, 1, 4, 2, 3, 1, 9, 0])[:, None].expand(8, 3)
     found = by_plan(plans, bits, plans.mask())
-    assert found.item == "plans"
+    assert found.item == "sequences"
     assert found.index.tolist() == [0, 2, 5, 1, 3, 4, 6]
     assert found.group.tolist() == [7, 7, 7, 2, 2, 2, 5]
     assert found.bits.tolist() == [5, 4, 1, 1, 2, 3, 9]

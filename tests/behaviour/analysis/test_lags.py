@@ -82,8 +82,8 @@ def test_gains_by_hand():
     result, want = how_far_back(plans, 3), by_hand(plans, 3)
     for one, (gain, size) in zip(result.gains, want, strict=True):
         assert one == pytest.approx(tuple(ratio_difference(gain, size)), abs=1e-7)
-    assert (result.unit, result.num_units) == ("groups", 4)
-    assert result.few == "4 groups are too few for a verdict"
+    assert (result.unit, result.num_units) == ("subjects", 4)
+    assert result.few == "4 subjects are too few for a verdict"
     assert not result.frame()["adds"].any()
 
 

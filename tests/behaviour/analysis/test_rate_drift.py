@@ -153,7 +153,7 @@ def test_plans_are_by_order_whatever_their_fragments():
     assert rate_drift(padded).changes == rate_drift(whole).changes
     mixed = rate_drift(whole[torch.tensor([5, 0, 7, 2, 4, 1, 3, 6])])
     np.testing.assert_allclose(mixed.changes, rate_drift(whole).changes)
-    assert (rate_drift(whole).unit, rate_drift(whole).num_units) == ("groups", 4)
+    assert (rate_drift(whole).unit, rate_drift(whole).num_units) == ("subjects", 4)
     assert rate_drift(whole).bouts.tolist() == actions.flatten().bincount().tolist()
     late = torch.arange(40) >= 20
     falls = (torch.rand(200, 40, generator=seeded(0)) >= torch.where(late, 0.3, 0.5)).long()

@@ -186,10 +186,10 @@ def test_strata_under_one_condition_are_left_out():
     plans = stratified([[0], [1], [0], [1], [0], [1], [1], [1]], [0, 0, 0, 0, 0, 0, 1, 1])
     found = compare_conditions(plans)
     assert found.design.left_out.tolist() == [6, 7]
-    assert found.design.notes == ("2 groups of strata that are under one condition only were left out.",)
+    assert found.design.notes == ("2 subjects of strata that are under one condition only were left out.",)
     assert found.tests == compare_conditions(plans[plans.group < 6]).tests
     alone = compare_conditions(stratified([[0], [0], [1], [1]], [0, 0, 1, 1]))
-    assert alone.verdict == "Not tested: in each stratum all plans are under one condition."
+    assert alone.verdict == "Not tested: in each stratum all sequences are under one condition."
 
 
 def test_a_group_in_two_strata_is_refused():
@@ -208,7 +208,7 @@ def test_rare_conditions_are_left_out_with_a_note(conditions, few):
     found = compare_conditions(plans, 199, seeded(0))
     common = [label for label, units in Counter(k for own in conditions for k in {*own}).items() if units > 1]
     rare = [f"drug {k}" for k in range(5) if k in {k for own in conditions for k in own} and k not in common]
-    assert found.design.notes[0] == f"Left out, with fewer than 2 groups: {', '.join(rare)}."
+    assert found.design.notes[0] == f"Left out, with fewer than 2 subjects: {', '.join(rare)}."
     assert found.condition_names == [f"drug {k}" for k in sorted(common)]
     assert found.design.left_out.tolist() == few
     alone = compare_conditions(plans[torch.isin(plans.condition, torch.tensor(common))], 199, seeded(0))

@@ -125,7 +125,7 @@ def test_without_conditions_there_is_no_section_and_with_one_it_says_why():
     plans = changed(between(6))
     assert section_of(replace(plans, condition=None, condition_names=None)) is None
     part = section_of(replace(plans, condition=torch.zeros(len(plans), dtype=torch.long)))
-    assert part.section.text == ["Not tested: all plans are under one condition."]
+    assert part.section.text == ["Not tested: all sequences are under one condition."]
     assert all(frame.empty for frame in part.frames.values())
 
 
@@ -133,7 +133,7 @@ def test_plans_without_groups_or_names_that_are_those_of_columns():
     names = ["p", "condition: feature"]
     plans = replace(changed(between(12, 1), condition_names=names), group=None)
     section, frames, *_ = section_of(plans)
-    assert frames["condition_blocks"]["plan"].tolist() == [f"plan {number}" for number in range(12)]
+    assert frames["condition_blocks"]["sequence"].tolist() == [f"sequence {number}" for number in range(12)]
     assert section.tables[1].headings == [
         "feature",
         *(f"mean,\n{name}" for name in names),
@@ -180,7 +180,7 @@ def test_units_that_cannot_be_compared_are_counted():
     plans = changed(within(8))
     lost = (plans.group == 3) & (plans.condition == 1)
     text = " ".join(section_of(plans[~lost])[0].text)
-    assert "1 groups that are not under every condition were left out" in text
+    assert "1 subjects that are not under every condition were left out" in text
     assert "left out" not in " ".join(section_of(plans)[0].text)
 
 
@@ -230,4 +230,4 @@ def test_strata_have_a_sentence_and_their_interaction_a_table(conditions):
 
 def test_a_rare_condition_is_noted():
     text = " ".join(section_of(changed([*between(12), [2]]))[0].text)
-    assert "Left out, with fewer than 2 groups: drug 2." in text
+    assert "Left out, with fewer than 2 subjects: drug 2." in text

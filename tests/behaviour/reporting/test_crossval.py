@@ -113,7 +113,7 @@ def by_hand(model: str, learned: Plans, held: Plans, seed: int, contexts: int | 
     ("kind", "grouped", "skip"),
     [
         ("nothing", False, 0),
-        ("index a plan", True, 0),
+        ("index a sequence", True, 0),
         pytest.param("index a step", False, 0, marks=pytest.mark.slow),
         ("index a step", True, 2),
     ],
@@ -145,7 +145,7 @@ def test_scores_are_those_of_fits_by_hand(kind, grouped, skip, tmp_path):
     assert compared == 4 * len(inputs)
 
 
-@pytest.mark.parametrize("kind", [pytest.param("features a plan", marks=pytest.mark.slow), "features a step"])
+@pytest.mark.parametrize("kind", [pytest.param("features a sequence", marks=pytest.mark.slow), "features a step"])
 def test_features_are_for_neural_models_alone(kind, tmp_path):
     plans = chain(context=context_of(kind))
     found = evaluated(plans, tmp_path, ("counts", "gru"), (ACTIONS, CONTEXT), seed=3)

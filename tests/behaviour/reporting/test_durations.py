@@ -207,7 +207,7 @@ def test_stars_are_findings():
         assert finding.starred == telling
         for one in part.section.tables[:3]:
             starred = [cell for row in one.rows for cell in row if "*" in cell]
-            assert bool(starred) == (telling and one.title == "Whether durations predict the next action")
+            assert bool(starred) == (telling and one.title == "Whether durations predict the next behaviour")
     alone = replace(timed(True), group=torch.zeros(24, dtype=torch.long))
     assert tables(alone)["next_by_duration"]["units"].tolist() == [24]
 
@@ -215,7 +215,7 @@ def test_stars_are_findings():
 def test_few_units_give_no_verdict():
     plans = replace(timed(True), group=torch.arange(24) % 3)
     made = section(plans).section
-    assert "3 groups are too few for a verdict" in " ".join(made.text)
+    assert "3 subjects are too few for a verdict" in " ".join(made.text)
     assert "*" not in "".join(cell for table in made.tables for row in table.rows for cell in row)
 
 
@@ -246,7 +246,7 @@ def test_at_most_some_panels_are_drawn():
     dwell = tables(plans)["dwell"]
     figure = dwell_figure(dwell)
     assert len(figure.axes) == MOST_PANELS
-    assert figure.get_suptitle() == f"the {MOST_PANELS} commonest of 16 actions"
+    assert figure.get_suptitle() == f"the {MOST_PANELS} commonest of 16 behaviours"
     assert len(dwell_figure(dwell[dwell["action"] == "a"]).axes) == 1
     with refuses("dwell"):
         dwell_figure(dwell[:0])
@@ -285,4 +285,4 @@ def test_how_many_actions_have_laws_of_transitions():
     follows = torch.cat([plans.actions[:, 1:], plans.actions[:, :1]], 1) == 0
     slow = torch.where(follows & (plans.actions == 2), 9.0, 1.0)
     laws = tables(replace(plans, durations=plans.durations * slow))["duration_laws"]
-    assert laws["what"].tolist() == ["the law of each action", "and of each transition (in 1 of 3 actions)"]
+    assert laws["what"].tolist() == ["the law of each behaviour", "and of each transition (in 1 of 3 behaviours)"]

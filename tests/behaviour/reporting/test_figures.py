@@ -78,7 +78,7 @@ def test_drift_stands_at_the_middles_of_parts_and_at_the_numbers_of_plans():
     assert len(dots.get_xdata()) == 1000
     assert (dots.get_xdata()[0], dots.get_xdata()[-1]) == (1, 2501)  # from the first to the last
     assert (dots.get_ydata() == 2.0 - (dots.get_xdata() - 1) / 2500).all()
-    assert title(between) == "from plan to plan (1,000 of 2,501 drawn)"
+    assert title(between) == "from sequence to sequence (1,000 of 2,501 drawn)"
     assert len(means.get_xdata()) == 20
     assert means.get_ydata().tolist() == pytest.approx((2.0 - (means.get_xdata() - 1) / 2500).tolist())
     assert [label.get_text() for label in below.get_yticklabels()] == ["low", "mid", "high"]  # from below

@@ -326,7 +326,7 @@ def test_the_groups_that_differ_most_are_drawn():
     panels = [axes for axes in figure.axes if axes.get_title(loc="left")]
     assert [axes.get_title(loc="left") for axes in panels] == ["g3", *names[19:]]
     assert [axes.lines[0].get_xydata().tolist() for axes in panels] == [[[1, 0]]] + [[]] * 11
-    assert "12 of 30 groups" in figure.get_suptitle()
+    assert "12 of 30 that differ most" in figure.get_suptitle()
     shown = panels[-1].images[0].get_array()
     assert [to_hex(shown[0, b, :3]) for b in (0, 1)] == [MORE, FEWER]
     with pytest.raises(ValueError, match="`group_names` must not be empty"):
@@ -410,9 +410,9 @@ def test_an_ethogram_of_durations_is_in_time():
 def test_ethograms_of_much_and_of_little():
     many = ethogram_figure(sessions(MANY, 200, 3000))
     assert len(strips(many)[0]) == 60
-    assert "60 of 200 plans" in many.axes[0].get_xlabel()
+    assert "60 of 200 sequences" in many.axes[0].get_xlabel()
     assert many.axes[0].images[0].get_array().shape[1] == MOST_BINS
-    assert many.legends[0].get_texts()[-1].get_text() == f"{len(MANY) - len(STRIPS) + 1} other actions"
+    assert many.legends[0].get_texts()[-1].get_text() == f"{len(MANY) - len(STRIPS) + 1} other behaviours"
     assert many.get_figheight() < 30
     ends = Plans(torch.tensor([[0, 1], [1, 1]]), 2, torch.tensor([0, 2])).with_end()
     assert len(strips(ethogram_figure(ends))[0]) == 1

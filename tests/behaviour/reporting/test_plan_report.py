@@ -61,8 +61,8 @@ def test_test_plans_are_scored_and_nothing_is_held_out_of_the_others(num):
     assert min(costs) - 1e-3 <= bits(made, "markov-0") <= max(costs) + 1e-3
     assert made.settings["folds"] == 1
     assert made.settings["cut"] == (num == 1)
-    assert ("1 plan is too few for a verdict" in " ".join(made.said)) == (num == 1)
-    assert made.results["unit"] == ("parts of the plan" if num == 1 else "plans")
+    assert ("1 sequence is too few for a verdict" in " ".join(made.said)) == (num == 1)
+    assert made.results["unit"] == ("parts of the sequence" if num == 1 else "sequences")
 
 
 def test_contexts_of_plans_and_of_test_plans_are_numbered_together():
@@ -84,8 +84,8 @@ def test_what_has_no_actions_is_left_out_and_counted():
     empty = replace(plans, lengths=torch.tensor([0, 4, 4, 0, 4, 0, 4, 4, 4, 4, 4, 4]))
     others = replace(plans[empty.mask().any(1)], lengths=None)
     made, whole = (report(some, **IN_TWO) for some in (empty, others))
-    assert made.settings["plans without actions, left out"] == 3
-    assert "plans without actions, left out" not in whole.settings
+    assert made.settings["sequences without behaviours, left out"] == 3
+    assert "sequences without behaviours, left out" not in whole.settings
     assert made.frames["plans"]["bits_per_action"].tolist() == whole.frames["plans"]["bits_per_action"].tolist()
 
 
@@ -136,7 +136,7 @@ def test_saved_priors_are_scored_on_the_actions_that_count_and_known_plans_are_m
     folders = [str(tmp_path / name) for name in ("one", "two")]
     made = report(plans, priors=folders, skip=skip, sections=["scores"])
     assert made.settings["training data"] == {folders[0]: 4}
-    assert f"{folders[0]} has learned from 4 of the 12 plans" in " ".join(made.said)
+    assert f"{folders[0]} has learned from 4 of the 12 sequences" in " ".join(made.said)
     marked = [row[0].endswith("(training data)") for row in made.sections[0].tables[0].rows]
     assert marked == [True, False]
     prior = MarkovPrior(3, 1).fit(others.actions)

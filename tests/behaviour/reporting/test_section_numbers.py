@@ -80,7 +80,7 @@ def test_what_is_in_the_file(plans, found):
         assert abs(middle - float(times[taken == action].mean())) > 0.1
         rows.append([NAMES[action], str(int(counts[action])), f"{share:.1f}", str(held), f"{middle:.3g}"])
     assert cells(part, 1) == rows
-    assert cells(part) == [["12", "105", "4", "20", "3", "5", "2 contexts, once a plan"]]
+    assert cells(part) == [["12", "105", "4", "20", "3", "5", "2 contexts, once a sequence"]]
     assert action_frame(plans)["median_duration"].tolist() == pytest.approx([float(row[4]) for row in rows], rel=5e-3)
 
 
@@ -104,7 +104,7 @@ def test_all_plans_are_described_whichever_were_scored(section, plans, found):
     [
         (None, "none"),
         (torch.tensor([[0, 4], [1, 1]]), "5 contexts, at each step"),
-        (torch.zeros(2, 3), "features, once a plan"),
+        (torch.zeros(2, 3), "features, once a sequence"),
         (torch.eye(2)[torch.tensor([[0, 1], [1, 0]])], "features, at each step"),
     ],
 )
@@ -197,7 +197,7 @@ def test_drift_within_plans_between_them_and_between_groups(plans, found):
     assert groups[["bits", "low", "high"]].to_numpy() == pytest.approx(np.array([*by_name.values()]), nan_ok=True)
     own = by_plan(*given)
     (box,) = part.section.figures
-    (cloud,) = (axes for axes in box.figure.axes if "plan to plan" in axes.get_title(loc="left"))
+    (cloud,) = (axes for axes in box.figure.axes if "sequence to sequence" in axes.get_title(loc="left"))
     group = own.group.tolist()
     index = [group[: at + 1].count(number) for at, number in enumerate(group)]
     assert cloud.lines[0].get_xdata().tolist() == index
@@ -205,13 +205,15 @@ def test_drift_within_plans_between_them_and_between_groups(plans, found):
     assert max(index) == 3
 
 
-@pytest.mark.parametrize(("length", "words"), [(20, "first 5 actions of each plan"), (8, "too short to leave out")])
+@pytest.mark.parametrize(
+    ("length", "words"), [(20, "first 5 behaviours of each sequence"), (8, "too short to leave out")]
+)
 def test_the_beginnings_of_plans_are_no_drift(length, words):
     """Actions repeat at probability .9 throughout; only the first, which nothing stands before, costs more."""
     repeats = torch.rand(200, length, generator=seeded(0)) < 0.9
     repeats[:, 0] = torch.rand(200, generator=seeded(1)) < 0.5
     plans = RecordedPlans((~repeats).long().cumsum(1) % 2, 2)
     part = drift_section(evaluate_saved({"chain": MarkovPrior(2, 1).fit(plans)}, plans, 0))
-    change = part.frames["drift_tests"].set_index("test").loc["change over a plan, bits"]
+    change = part.frames["drift_tests"].set_index("test").loc["change over a sequence, bits"]
     assert (change["low"] < 0 < change["high"]) == (length == 20)
     assert any(words in line for line in part.section.text)

@@ -100,8 +100,8 @@ def test_what_is_asked_for_is_done(made):
 def test_the_lead_names_the_best_model(made):
     best = made.tables["plans"].sort_values("bits_per_action").iloc[0]
     assert (
-        f"The best model, {best.model}, takes {best.bits_per_action:.3f} bits per action"
-        f" (95 % interval {best.low:.3f} to {best.high:.3f} over groups)."
+        f"The best model, {best.model}, takes {best.bits_per_action:.3f} bits per behaviour"
+        f" (95 % interval {best.low:.3f} to {best.high:.3f} over subjects)."
     ) in made.said
 
 
@@ -163,7 +163,7 @@ def animals(number: int, sessions: int = 8) -> Plans:
 def test_few_groups_bear_no_verdict(number, enough):
     """Below five animals nothing is starred, ringed, dotted or called best; the numbers stand."""
     whole = report(animals(number), fits=QUICK_IN_TWO)
-    said, few = verdicts(whole), f"{number} groups are too few for a verdict"
+    said, few = verdicts(whole), f"{number} subjects are too few for a verdict"
     assert (few in " ".join(whole.said)) != enough
     assert ("The best model" in " ".join(whole.said)) == enough
     assert ("*" in said) == enough
@@ -171,15 +171,15 @@ def test_few_groups_bear_no_verdict(number, enough):
     assert ("p" in said.split("\n")) == enough  # the heading of a column
     assert said.count(few) == (0 if enough else 7)  # the lead, and each section that would draw one
     assert whole.tables["plans"]["low"].notna().all()
-    assert "over groups" in " ".join(whole.said)
+    assert "over subjects" in " ".join(whole.said)
 
 
 def test_parts_of_a_plan_are_not_plans():
     """A single long session is one: its parts have intervals, and bear no verdict."""
     (plan,) = markov_plans(markov_probs(3, 1, 0, 1.5), 1, 400, 1).actions
     found = report(Plans(plan[None], 3), fits=QUICK_IN_TWO)
-    assert "over parts of the plan" in " ".join(found.said)
-    assert "1 plan is too few for a verdict" in " ".join(found.said)
+    assert "over parts of the sequence" in " ".join(found.said)
+    assert "1 sequence is too few for a verdict" in " ".join(found.said)
     assert "*" not in verdicts(found)
 
 
