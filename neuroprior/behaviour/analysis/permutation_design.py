@@ -115,8 +115,8 @@ class PermutationDesign:
             groups = item == "subjects" and plans.group_names
             odd = (
                 f"Under several conditions: {listed([groups[n] for n in several] if groups else several)}; the other"
-                f" {int(single.sum())} {item} are under one each. If that is a slip, mend the condition of their plans;"
-                f" if not, leave these {item} out, and the others are compared with one another"
+                f" {int(single.sum())} {item} are under one each. If that is a slip, mend the condition of their"
+                f" sequences; if not, leave these {item} out, and the others are compared with one another"
             )
         remaining, stratum = of_unit[kept].unique(return_inverse=True)
         return PermutationDesign(
