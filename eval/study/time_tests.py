@@ -7,13 +7,13 @@ import numpy as np
 import pandas as pd
 import torch
 
+from neuroprior._statistics import LEVEL
 from neuroprior.behaviour import Recordings, duration_survival, how_far_back, rate_drift, share_interval
 from neuroprior.behaviour.reporting.document import table
 from neuroprior.behaviour.reporting.page import Table
 from neuroprior.behaviour.study import BEHAVIOURS, FADING, LONGER, NEXT, RITUAL, RITUAL_WEIGHT, SECONDS, SPREAD
 
 ANIMALS, SESSIONS = 12, 2
-LEVEL = 0.05
 TOGETHER = 10
 """Studies of one job."""
 

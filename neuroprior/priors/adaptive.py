@@ -19,9 +19,9 @@ from neuroprior.priors.learning import (
     counted_plans,
     known_plans,
     plans_for,
+    pop_validation,
     split_validation,
     training_plans,
-    validation_plans,
 )
 from neuroprior.priors.prior import Prior
 from neuroprior.sampling.states import State
@@ -155,44 +155,48 @@ class AdaptivePrior(Prior):
         if all(c == inf for c in self.concentrations):
             return logits
         probs = logits.softmax(-1)
-        for c, (counts, total) in zip(self.concentrations, self._counts(actions, first, logits.shape[1]), strict=True):
-            if c < inf:
-                probs = (counts + c * probs) / (total + c)
+        levels = [level for level, c in enumerate(self.concentrations) if c < inf]
+        for level, (counts, total) in zip(levels, self._counts(actions, first, logits.shape[1], levels), strict=True):
+            c = self.concentrations[level]
+            probs = (counts + c * probs) / (total + c)
         return probs.log()
 
-    def _counts(self, actions: Tensor, first: int, steps: int) -> list[tuple[Tensor, Tensor]]:
-        """What was counted at each level before each of the steps from `first` on.
+    def _counts(self, actions: Tensor, first: int, steps: int, levels: Sequence[int]) -> list[tuple[Tensor, Tensor]]:
+        """What was counted before each of the steps from `first` on.
 
         Args:
             actions: int64 `[N, L]`; -1 where there is none, between sequences.
             first, steps: of the T steps.
+            levels: ascending.
 
         Returns:
-            For each level how often each action followed, `[N, T, A]`, and their sum, `[N, T, 1]`.
+            For each of the levels how often each action followed, `[N, T, A]`, and their sum, `[N, T, 1]`.
         """
         now = torch.arange(first, first + steps, device=actions.device)
         past = torch.arange(min(first + steps - 1, actions.shape[1]), device=actions.device)
         alike = (past < now[:, None]).expand(len(actions), -1, -1)
         before = actions[:, : len(past)]
         one_hot = functional.one_hot(before.clamp(min=0), self.num_actions).float() * (before >= 0)[..., None]
-        code, found = torch.zeros(len(actions), steps, dtype=torch.long, device=actions.device), []
-        for level, name in enumerate(self.tables):
+        code, columns = torch.zeros(len(actions), steps, dtype=torch.long, device=actions.device), []
+        for level in range(levels[-1] + 1):
             if level > 0:
                 # The action so many steps before each; -1, before the first, is like no other.
                 padded = functional.pad(actions, (level, 0), value=-1)
                 then, last = padded[:, : len(past)], padded[:, now]
                 alike = alike & (last[..., None] == then[:, None]) & (then >= 0)[:, None]
                 code = code + last.clamp(min=0) * self.num_actions ** (level - 1)
+            if level not in levels:
+                continue
             weights = alike.float()
             if self.decay < 1:
                 weights = weights * self.decay ** (weights.sum(-1, keepdim=True) - weights.cumsum(-1))
             counts = weights @ one_hot
-            earlier = getattr(self, name)
+            earlier = getattr(self, self.tables[level])
             if len(earlier) and level <= first + steps:
                 complete = (now >= level)[:, None]
                 counts = counts + earlier[code] * complete * self.decay ** alike.sum(-1, keepdim=True)
-            found.append((counts, counts.sum(-1, keepdim=True)))
-        return found
+            columns.append((counts, counts.sum(-1, keepdim=True)))
+        return columns
 
     def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Fit the base, and the concentrations on groups that it has not learned from; returns self.
@@ -214,9 +218,7 @@ class AdaptivePrior(Prior):
         for name in self.tables:
             self.register_buffer(name, getattr(self, name)[:0])
         if self.fit_settings:
-            given = settings.pop("validation", None)
-            given = validation_plans(self, given) if isinstance(given, Plans) else given
-            learned, held_out = split_validation(plans, given, generator)
+            learned, held_out = split_validation(plans, pop_validation(self, settings), generator)
             known = {"validation": held_out, **settings}
             self.base.fit(plans_for(self.base, learned), generator=generator, **known)
             self.learn_concentrations([(self.base, held_out)])
@@ -255,10 +257,11 @@ class AdaptivePrior(Prior):
             actions, mask, length = part.actions.long(), part.mask(), part.max_length
             for some, now in _blocks(len(part), length):
                 index, inside = actions[some, now, None], mask[some, now]
-                found = self._counts(actions[some], now.start, min(now.stop, length) - now.start)
-                values = [log_probs[some, now].exp(), *(counts for counts, _ in found)]
+                steps = min(now.stop, length) - now.start
+                counted = self._counts(actions[some], now.start, steps, range(len(self.tables)))
+                values = [log_probs[some, now].exp(), *(counts for counts, _ in counted)]
                 taken = [value.gather(-1, index)[inside][:, 0].double() for value in values]
-                totals = [total[inside][:, 0].double() for _, total in found]
+                totals = [total[inside][:, 0].double() for _, total in counted]
                 parts.append((taken[0], torch.stack(taken[1:]), torch.stack(totals)))
         return join_columns(parts)
 

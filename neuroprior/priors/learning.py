@@ -1,5 +1,7 @@
 """The plans that a prior learns from, counts in or is chosen on: checked, and without a context it does not take."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -60,6 +62,12 @@ def validation_plans(prior: Prior, plans: Plans | Tensor) -> Plans:
     check_actions(prior, plans)
     prior.check_context_of(plans)
     return plans
+
+
+def pop_validation(prior: Prior, settings: dict[str, Any]) -> Plans | float | None:
+    """Take what is held out from the settings of a `fit`: a share, or plans as `prior` can predict them."""
+    validation: Plans | float | None = settings.pop("validation", None)
+    return validation_plans(prior, validation) if isinstance(validation, Plans) else validation
 
 
 def known_plans(prior: Prior, plans: Plans | Tensor) -> Plans:

@@ -18,9 +18,6 @@ from neuroprior.priors.counts import MarkovPrior
 
 FOLDS = 5
 
-LEVELS = (10.0, 10.0)
-"""Where the search of concentrations begins: of the shares of behaviours, and of the transitions."""
-
 Array = NDArray[np.float64]
 
 
@@ -96,7 +93,7 @@ def individuality(source: RecordedPlans | Recordings) -> Individuality:
         raise ValueError(f"`source` must have at least 3 subjects, got {subjects}")
     size, log_probs = plans.num_actions, torch.zeros(2, *plans.actions.shape)
     for rest, held_out in folds(plans, min(FOLDS, subjects)):
-        prior = AdaptivePrior(MarkovPrior(size, 1), LEVELS).fit(plans[rest])
+        prior = AdaptivePrior(MarkovPrior(size, 1)).fit(plans[rest])
         log_probs[0, held_out] = prior.base.action_log_probs(plans[held_out])
         log_probs[1, held_out] = prior.individual_log_probs(plans[held_out])
     present, row = plans.group.unique(return_inverse=True)
@@ -108,6 +105,6 @@ def individuality(source: RecordedPlans | Recordings) -> Individuality:
         for values in log_probs
     )
     total = ratio_difference((alone - adapted).sum(1), bouts.sum(1).double().numpy())
-    whole = AdaptivePrior(MarkovPrior(size, 1), LEVELS).fit(plans)
+    whole = AdaptivePrior(MarkovPrior(size, 1)).fit(plans)
     names = group_names(plans, present), action_names(plans)
     return Individuality(*names, bouts.numpy(), alone, alone - adapted, total, whole.concentrations)

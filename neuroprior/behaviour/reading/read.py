@@ -2,13 +2,14 @@
 
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import combinations, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from neuroprior.behaviour.reading.columns import NOT_USED, Columns, find_roles
 from neuroprior.behaviour.reading.layouts import LAYOUTS
@@ -162,14 +163,11 @@ def _read_sheet(sheet: Sheet, options: Options) -> Part:
 
 def _note_overlaps(table: Table, part: Part) -> None:
     """Note that bouts begin before those of other behaviours have ended."""
-    events = part.events
-    timed = np.flatnonzero((events["stop"] > events["start"]) & (events["behaviour"] != ""))
-    keys = [key for key in (*KEYS, "observer") if key in events]
-    unit = np.asarray(events.iloc[timed].groupby(keys, sort=False).ngroup(), np.int64)
-    late = timed[overlapping(unit, *(events[end].to_numpy(float)[timed] for end in ("start", "stop")))]
+    labelled = np.flatnonzero(part.events["behaviour"] != "")
+    late, number = _overlapping_rows(part.events.iloc[labelled], (*KEYS, "observer"))
     if late.size:
-        where = table.place(int(part.rows[late.min()]))
-        what = f"{late.size:,} of {timed.size:,} bouts begin before another one has ended (first in {where})"
+        where = table.place(int(part.rows[labelled[late.min()]]))
+        what = f"{late.size:,} of {number:,} bouts begin before another one has ended (first in {where})"
         part.first_notes.append(f"{what}: shares of time add up to more than 100 %")
 
 
@@ -206,15 +204,16 @@ def _check_observers(table: Table, part: Part, problems: Problems) -> None:
 
 def _overlap_share(events: pd.DataFrame) -> tuple[float, int]:
     """Return the share of bouts that begin before one of the same behaviour ended, and the row of the first."""
-    rows = np.flatnonzero(events["stop"] > events["start"])
-    if not rows.size:
-        return 0.0, 0
-    bouts = events.iloc[rows]
-    keys = [key for key in (*KEYS, "observer", "behaviour") if key in bouts]
-    unit = np.asarray(bouts.groupby(keys, sort=False).ngroup(), np.int64)
-    start, stop = bouts["start"].to_numpy(float), bouts["stop"].to_numpy(float)
-    late = overlapping(unit, start, stop)
-    return len(late) / len(rows), int(rows[late[0]]) if late.size else 0
+    late, number = _overlapping_rows(events, (*KEYS, "observer", "behaviour"))
+    return (late.size / number, int(late[0])) if late.size else (0.0, 0)
+
+
+def _overlapping_rows(events: pd.DataFrame, columns: Sequence[str]) -> tuple[NDArray[np.int64], int]:
+    """Return the rows of bouts that begin before one alike in `columns` ended, and how many bouts take time."""
+    timed = np.flatnonzero(events["stop"] > events["start"])
+    bouts = events.iloc[timed]
+    unit = np.asarray(bouts.groupby([name for name in columns if name in bouts], sort=False).ngroup(), np.int64)
+    return timed[overlapping(unit, *(bouts[end].to_numpy(float) for end in ("start", "stop")))], timed.size
 
 
 def _separating_column(table: Table, part: Part) -> str | None:

@@ -49,7 +49,7 @@ LONG = 100
 """Mean number of actions of plans from which on priors that follow the individual are tried."""
 
 LEVELS = (10.0, 10.0, 10.0)
-"""Where the search of their concentrations begins: at histories of none to two actions."""
+"""They count after histories of none, one and two actions; `fit` sets these concentrations."""
 
 DEPTH = 10
 """Depth of the context trees among experts and baselines."""

@@ -23,7 +23,14 @@ from neuroprior.priors.ensembles.mixture import (
     weights_before,
 )
 from neuroprior.priors.ensembles.stacked import context_for
-from neuroprior.priors.learning import counted_plans, known_plans, plans_for, split_validation, training_plans
+from neuroprior.priors.learning import (
+    counted_plans,
+    known_plans,
+    plans_for,
+    pop_validation,
+    split_validation,
+    training_plans,
+)
 from neuroprior.priors.neural.neural import training_settings
 from neuroprior.priors.prior import Prior, taken_of
 from neuroprior.priors.uniform import UniformPrior
@@ -235,7 +242,7 @@ class CombinedPrior(MixturePrior):
         self.check_settings(settings)
         plans = training_plans(self, plans)
         generator = generator_on(generator, "cpu")
-        learned, held_out = split_validation(plans, self._validation_of(settings), generator)
+        learned, held_out = split_validation(plans, pop_validation(self, settings), generator)
         self.spare, self.left_out = nn.ModuleList(), nn.ModuleList()
         if self.given:
             self.experts = nn.ModuleList(*self.given).to(self.device)

@@ -15,9 +15,9 @@ from neuroprior.priors.learning import (
     counted_plans,
     known_plans,
     plans_for,
+    pop_validation,
     split_validation,
     training_plans,
-    validation_plans,
 )
 from neuroprior.priors.prior import Prior, taken_of
 from neuroprior.sampling.states import State
@@ -161,15 +161,10 @@ class MixturePrior(Prior):
         self.check_settings(settings)
         plans = training_plans(self, plans)
         generator = generator_on(generator, "cpu")
-        learned, held_out = split_validation(plans, self._validation_of(settings), generator)
+        learned, held_out = split_validation(plans, pop_validation(self, settings), generator)
         self.fit_experts(learned, held_out, generator, settings)
         self.learn_weights(held_out)
         return self.recount(plans)
-
-    def _validation_of(self, settings: dict[str, Any]) -> Plans | float | None:
-        """What is held out, which is taken from the settings of `fit`: as plans that this prior can predict."""
-        given: Plans | float | None = settings.pop("validation", None)
-        return validation_plans(self, given) if isinstance(given, Plans) else given
 
     def fit_experts(
         self, learned: Plans, held_out: Plans, generator: torch.Generator, settings: Mapping[str, Any]
