@@ -20,6 +20,7 @@ COMMANDS = {
     "search": Command("eval.compare.search:search", "what helps a planner that samples"),
     "live": Command("eval.live.command:live", "priors that learn online while the world changes"),
     "quality": Command("eval.quality.command:quality", "how near priors come to sources of known entropy"),
+    "screening": Command("eval.quality.screening:screening", "whether networks that would pay are trained"),
     "puzzles": Command("eval.puzzles.command:puzzles", "Sokoban and sliding tiles solved by policy-guided search"),
     "control": Command(
         "eval.control.command:control_experiment", "priors that propose continuous actions to iCEM, MPPI and shooting"

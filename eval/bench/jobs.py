@@ -38,7 +38,7 @@ from neuroprior import (
 from neuroprior.control import DoubleIntegrator, ICEMPlanner, MPPIPlanner, VectorGRU
 from neuroprior.control import control as run_control
 from neuroprior.priors import CombinedPrior
-from neuroprior.priors.ensembles.candidates import DEPTH, ORDERS, networks
+from neuroprior.priors.ensembles.candidates import DEPTH, OF_EFFORT, ORDERS, networks
 from neuroprior.puzzles import AStarPlanner, sliding_tiles
 from neuroprior.sampling import sample_in_world
 from neuroprior.worlds import GridWorld, cube, from_simulator, maze
@@ -270,12 +270,16 @@ def fit_combined(scale: float) -> Job:
         for order in ORDERS:
             MarkovPrior(4, order).fit(plans)
         ContextTreePrior(4, DEPTH).fit(plans)
-        for prior in networks(4, {}, "standard", 0):
+        for prior in networks(4, {}, "standard", 0).values():
             prior.fit(plans, generator=generator, **how)
 
     return Job(
         f"fit the combined prior on {len(plans):,} plans of length 16, 200 steps",
-        lambda device: lambda: CombinedPrior(4).fit(plans, generator=torch.Generator().manual_seed(0), **how),
+        lambda device: (
+            lambda: CombinedPrior(4, networks=OF_EFFORT["standard"]).fit(
+                plans, generator=torch.Generator().manual_seed(0), **how
+            )
+        ),
         (Peer("its parts, one after the other", lambda: parts, round(1 / 1.5, 2)),),
     )
 

@@ -215,6 +215,8 @@ def fit(
         else:
             learned_from = parts.plans if parts.folds > 1 else parts.learned_from
             made.fit(learned_from, generator=torch.Generator().manual_seed(seed), **settings)
+        if isinstance(made, CombinedPrior) and isinstance(fresh, CombinedPrior):
+            fresh.networks = made.trained  # those that did not pay are not tried again in each fold
         if "progress" in made.fit_settings:
             settings["progress"] = False  # of several processes, which would get mixed
         report(folder, made, curve, parts, fresh, settings)

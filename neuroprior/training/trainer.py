@@ -98,6 +98,22 @@ def train(
     return module.curve
 
 
+def planned_steps(plans: Sequences, settings: Settings) -> int:
+    """Return the most gradient steps that a training takes.
+
+    Args:
+        plans: to learn from.
+        settings: how.
+
+    Example:
+        >>> planned_steps(Plans(torch.zeros(9, 5, dtype=torch.long), num_actions=2), Settings())
+        1000
+    """
+    steps = PlansModule(plans, plans, settings, 0).settings.max_steps
+    assert steps is not None
+    return steps
+
+
 def make_trainer(
     data: PlansModule, device: torch.device, folder: Path | None = None
 ) -> tuple[lightning.Trainer, "Keeper"]:

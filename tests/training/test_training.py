@@ -171,9 +171,9 @@ def test_the_combined_prior_counts_first_and_trains_while_there_is_time(monkeypa
 
     monkeypatch.setattr(candidates, "monotonic", lambda: now[0])
     monkeypatch.setattr(GRUPrior, "fit", fit)
-    monkeypatch.setattr(candidates, "networks", lambda *_: [GRUPrior(3, 4), GRUPrior(3, 4), GRUPrior(3, 4)])
+    monkeypatch.setattr(candidates, "networks", lambda *_: {name: GRUPrior(3, 4) for name in candidates.NETWORKS})
     settings = {"seconds": 50.0}
-    made = list(candidates.fitted_experts(plans, plans[:10], {}, "full", seeded(0), settings))
+    made = candidates.fitted_experts(plans, plans[:10], {}, "full", seeded(0), settings).fitted
     assert given == [50 / 3, 10]
     assert sum(isinstance(prior, GRUPrior) for prior in made) == 2
     assert settings == {"seconds": 50.0}

@@ -16,11 +16,11 @@ from neuroprior.behaviour.durations.past_durations import PastDurations
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, fair_split, folds, num_units
 from neuroprior.plans.plans import AnyPlans
-from neuroprior.priors import CombinedPrior, GRUPrior, MarkovPrior, Prior, StackedPrior, TransformerPrior
+from neuroprior.priors import CombinedPrior, GRUPrior, MarkovPrior, Prior
 from neuroprior.priors.construction import construct, context_arguments
 from neuroprior.priors.counts import TooLargeError
-from neuroprior.priors.ensembles import candidates
-from neuroprior.priors.ensembles.candidates import Effort, fitted_experts, number_tried
+from neuroprior.priors.ensembles.candidates import NETWORKS, OF_EFFORT, Effort, fitted_experts, number_tried
+from neuroprior.priors.ensembles.screening import Screening
 from neuroprior.priors.learning import plans_for, split_validation
 
 Arrays = dict[str, np.ndarray[Any, Any]]
@@ -30,9 +30,6 @@ ACTIONS, CONTEXT, DURATIONS = "actions", "actions and context", "actions and dur
 
 WITH = {ACTIONS: "", CONTEXT: ", with context", DURATIONS: ", with durations"}
 """The inputs in the order of tables, and what names of models say of them."""
-
-NETWORKS: dict[str, type[Prior]] = {"gru": GRUPrior, "transformer": TransformerPrior, "stacked": StackedPrior}
-"""Models that are trained."""
 
 COMBINED = "combined"
 """The combined prior."""
@@ -73,6 +70,7 @@ class Design:
     effort: Effort = "standard"  # of the combined prior
     reach: int = 16  # the most past actions whose information is measured
     cut: bool = False  # whether the plans are consecutive parts of a single one
+    screened: bool = False  # whether networks are trained only where they promise to bring something in the first fold
     version: str = __version__  # of the library
 
     @property
@@ -83,7 +81,7 @@ class Design:
     @property
     def experts(self) -> set[str]:
         """The models among the experts of the combined prior, which its job scores as well."""
-        return {name for name, kind in NETWORKS.items() if kind in candidates.NETWORKS[self.effort]}
+        return set(OF_EFFORT[self.effort])
 
 
 @dataclass(frozen=True)
@@ -93,9 +91,15 @@ class Job:
     fold: int
     kind: str
     inputs: str
+    networks: tuple[str, ...] | None = None  # that the combined prior trains; None: as the design says
 
     def __str__(self) -> str:
         return f"fold{self.fold}-{self.kind}{WITH[self.inputs].replace(', with ', '-')}"
+
+
+def trained_networks(arrays: Arrays) -> tuple[str, ...]:
+    """Return the names of the networks that a job trained."""
+    return tuple(name for name in NETWORKS if f"{name}/how" in arrays)
 
 
 def counted(plans: Plans, skip: int, cut: bool = False) -> Tensor:
@@ -121,8 +125,9 @@ def fit_and_score(plans: Plans, test: Plans | None, design: Design, job: Job) ->
 
     Returns:
         Arrays by the name of the model and what they are, such as "gru/bits". "how": its settings. "bits" `[n, L]`,
-        float32: those of each held-out action. Or, of `LAGS`, "bits" and "actions" `[J, U]`: those of the same actions
-        with 0, 1, ... J - 1 past ones known, by independent unit.
+        float32: those of each held-out action. "promise": of a network that was not trained for it, the most nats per
+        action that it might bring. Or, of `LAGS`, "bits" and "actions" `[J, U]`: those of the same actions with 0, 1,
+        ... J - 1 past ones known, by independent unit.
     """
     learned, index = split(plans, test, design, job.fold)
     whole = plans if test is None else test
@@ -136,15 +141,20 @@ def fit_and_score(plans: Plans, test: Plans | None, design: Design, job: Job) ->
     if job.kind in LAGS:
         return _by_lag(job.kind, learned, scored, design, seed)
     found: Arrays = {}
-    for name, how, prior in _fitted(job.kind, learned, scored, design, seed):
+    for name, how, prior in _fitted(job, learned, scored, design, seed):
+        if isinstance(prior, Screening):
+            found[f"{name}/promise"] = np.array(prior.gain)
+            continue
         found |= {f"{name}/how": np.array(how), f"{name}/bits": action_bits(prior, scored).float().numpy()}
     return found
 
 
-def _fitted(kind: str, learned: Plans, scored: Plans, design: Design, seed: int) -> Iterator[tuple[str, str, Prior]]:
-    """The name, the settings and the prior of each model of a kind."""
+def _fitted(
+    job: Job, learned: Plans, scored: Plans, design: Design, seed: int
+) -> Iterator[tuple[str, str, Prior | Screening]]:
+    """The name, the settings and the prior of each model of a job, or what it promised in place of the prior."""
     sizes = context_arguments(learned, scored)
-    learned = divisible(learned)
+    learned, kind = divisible(learned), job.kind
     if "context_size" in sizes and kind in ("counts", "stacked"):
         return  # features cannot be counted
     generator = torch.Generator().manual_seed(seed)
@@ -158,15 +168,18 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: Design, seed: int)
                 yield baseline.model, baseline.how, baseline.prior.fit(plans_for(baseline.prior, learned))
     elif kind == COMBINED:
         training, validation = split_validation(learned, None, generator)
-        experts = list(fitted_experts(training, validation, sizes, design.effort, generator, design.training))
+        networks = OF_EFFORT[design.effort] if job.networks is None and not design.screened else job.networks
+        how = (design.effort, generator, design.training, networks)
+        experts, trained, left_out = fitted_experts(training, validation, sizes, *how)
         combined = construct(partial(CombinedPrior, experts=experts), learned.num_actions, sizes)
         assert isinstance(combined, CombinedPrior)
         combined.learn_weights(validation, number_tried(experts), training)
-        names = {type_: name for name, type_ in NETWORKS.items()}
-        for expert in [expert.recount(learned) for expert in experts]:
-            if type(expert) in names:
-                yield names[type(expert)], "", expert
-        yield kind, combined.summary(), combined
+        counted = [expert.recount(learned) for expert in experts]
+        yield from (
+            (name, "", expert) for name, expert in zip(trained, counted[len(counted) - len(trained) :], strict=True)
+        )
+        yield from ((name, "", promise) for name, promise in left_out.items())
+        yield COMBINED, combined.summary(), combined
     else:
         prior: Any = construct(NETWORKS[kind], learned.num_actions, sizes | {"seed": seed})
         yield kind, "", prior.fit(plans_for(prior, learned), generator=generator, **design.training)

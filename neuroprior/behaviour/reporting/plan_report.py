@@ -20,6 +20,7 @@ from neuroprior.behaviour.reporting.document import Document, FigureKind, check_
 from neuroprior.behaviour.reporting.findings import headline
 from neuroprior.behaviour.reporting.fits import (
     ACTIONS,
+    COMBINED,
     CONTEXT,
     COSTS,
     COUNTS,
@@ -29,6 +30,7 @@ from neuroprior.behaviour.reporting.fits import (
     Design,
     Job,
     counted,
+    trained_networks,
 )
 from neuroprior.behaviour.reporting.options import (
     Files,
@@ -210,7 +212,8 @@ def _cross_validate(
         other, cut = _in_parts(other)
     scored = learned if other is None else other
     number = 1 if other is not None else _folds(_name(plans), learned, fits)
-    design = Design(number, fits.seed, skip, fits.max_steps, fits.effort, cut=cut)
+    screened = fits.models is None and fits.effort != "full"
+    design = Design(number, fits.seed, skip, fits.max_steps, fits.effort, cut=cut, screened=screened)
     kinds: list[str] = [*fits.kinds]
     if with_lags:
         kinds += LAGS if set(kinds) != {"counts"} else LAGS[:1]
@@ -231,6 +234,11 @@ def _cross_validate(
         more |= {} if test is None else {"test": _name(test)}
         return replace(found, plans=whole, settings=settings | found.settings | more)
 
+    def fitting(some: list[Job]) -> Iterator[_Stage]:
+        how: dict[str, Any] = {"processes": fits.processes, "dask": fits.dask, "title": "networks"}
+        for seconds in run.each(some, cost=lambda job: COSTS[job.kind], **how):
+            yield _Stage(found, (), _still(f"networks (about {in_words(seconds)} more)", *later[1:]))
+
     if out is not None:
         Path(out).mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory() as temporary:
@@ -244,10 +252,17 @@ def _cross_validate(
         found = evaluated(counts)
         yield _Stage(found, OF_MODELS, _still(*later))
         if networks:
-            how: dict[str, Any] = {"processes": fits.processes, "dask": fits.dask, "title": "networks"}
-            for seconds in run.each(networks, cost=lambda job: COSTS[job.kind], **how):
-                yield _Stage(found, (), _still(f"networks (about {in_words(seconds)} more)", *later[1:]))
-            found = evaluated(todo)
+            # Screened, the first fold decides which networks are trained in the others.
+            first = [job for job in networks if not screened or (job.kind == COMBINED and job.fold == 0)]
+            yield from fitting(first)
+            trained = {job.inputs: trained_networks(run.read(job)) for job in first}
+            rest = [
+                replace(job, networks=trained[job.inputs] if job.kind == COMBINED else None)
+                for job in networks
+                if job not in first and (job.kind == COMBINED or trained[job.inputs])
+            ]
+            yield from fitting(rest)
+            found = evaluated([*counts, *first, *rest])
             yield _Stage(found, (*OF_MODELS, *["durations"] * (DURATIONS in inputs)), _still(*later[1:]))
         if modes:
             yield _Stage(found, ("modes",), "")

@@ -151,7 +151,7 @@ def evaluate(
     scored = plans if test is None else test
     mask = counted(scored, design.skip, design.cut)
     held_out = [split(plans, test, design, fold)[1] for fold in range(design.folds)]
-    models, gains = [], []
+    models, gains, promises = [], [], dict[str, float]()
     results: dict[tuple[str, str], list[Arrays]] = {}
     for job, arrays in zip(todo, found, strict=True):
         results.setdefault((job.kind, job.inputs), []).append(arrays)
@@ -159,6 +159,9 @@ def evaluate(
         if kind in LAGS:
             gains += _gains(by_fold[0], inputs)
             continue
+        for key, value in (item for arrays in by_fold for item in arrays.items() if item[0].endswith("/promise")):
+            name = key.removesuffix("/promise") + WITH[inputs]
+            promises[name] = max(float(value) / log(2), promises.get(name, 0.0))
         for name in [key.removesuffix("/how") for key in by_fold[0] if key.endswith("/how")]:
             parts = [{key.removeprefix(f"{name}/"): array for key, array in arrays.items()} for arrays in by_fold]
             # A chain may be too large for its tables in some folds.
@@ -173,7 +176,8 @@ def evaluate(
     gains.sort(key=lambda row: (row["context"] == CONTEXT, row["model"] != COUNTED))
     table = pd.DataFrame(gains)
     reference = None if best is None else (best, f"{best.name} ({best.inputs})")
-    return Evaluation(plans, scored, mask, models, reference, scored[held_out[0]], table, asdict(design))
+    settings = asdict(design) | ({"promises": promises} if promises else {})
+    return Evaluation(plans, scored, mask, models, reference, scored[held_out[0]], table, settings)
 
 
 def _gains(arrays: Arrays, inputs: str) -> list[dict[str, Any]]:

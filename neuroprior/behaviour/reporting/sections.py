@@ -29,6 +29,7 @@ from neuroprior.behaviour.reporting.recordings import recording_section
 from neuroprior.behaviour.reporting.scores import Evaluation
 from neuroprior.behaviour.reporting.transitions import transition_section
 from neuroprior.plans import Plans, constant_context, has_patterns
+from neuroprior.plans.columns import listed
 
 LISTED_LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 20)
 BEGINNING = 5  # actions of a plan that do not count in drift
@@ -133,6 +134,7 @@ def score_section(found: Evaluation) -> Part | None:
         " corrected for the number of models.",
     ]
     text = text[:1] if saved else text
+    text += _not_trained(found)
     text.append(without_verdict(found.too_few) or "A difference whose interval holds 0 is not significant.")
     caption_of_figure = f"Bits per {'' if saved else 'held-out '}behaviour, 95 % intervals over {found.unit}."
     best = found.best
@@ -141,6 +143,20 @@ def score_section(found: Evaluation) -> Part | None:
     title = "Scores" if saved else "Held-out scores"
     shown = table(scores, columns, caption, align="llrrrr")
     return Part(Section(title, text, [shown], [box]), {"plans": scores})
+
+
+def _not_trained(found: Evaluation) -> list[str]:
+    """A sentence on the networks that promised too little to be trained."""
+    promises, scored = found.settings.get("promises", {}), {model.label for model in found.models}
+    names = [name for name in promises if name not in scored]
+    if not names:
+        return []
+    names += [name for name in ("transformer",) if name in found.settings["models"] and name not in scored]
+    most = max(promises[name] for name in names if name in promises)
+    return [
+        f"Not trained: {listed(names)}. A tenth of the training, in the first fold, promised a gain of at most"
+        f" {most:.4f} bits per behaviour, too little to be kept. `--models` trains networks in any case."
+    ]
 
 
 def lag_section(found: Evaluation) -> Part | None:

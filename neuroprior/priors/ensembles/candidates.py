@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from math import inf
 from time import monotonic
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 
@@ -14,6 +14,8 @@ from neuroprior.plans.plans import Plans
 from neuroprior.priors.adaptive import AdaptivePrior
 from neuroprior.priors.construction import construct
 from neuroprior.priors.counts import BACKOFFS_TRIED, Chains, ContextTreePrior, MarkovPrior, TooLargeError
+from neuroprior.priors.ensembles.pooling import stack_forecasts
+from neuroprior.priors.ensembles.screening import Screening, screen
 from neuroprior.priors.ensembles.stacked import StackedPrior
 from neuroprior.priors.learning import plans_for
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
@@ -21,15 +23,17 @@ from neuroprior.priors.prior import Prior
 from neuroprior.priors.uniform import UniformPrior
 
 Effort = Literal["fast", "standard", "full"]
-"""What is spent: "fast" trains a GRU beside what counts, "standard" a stacked prior as well, "full" a
-transformer as well."""
+"""What is spent: "fast" trains a GRU beside what counts where it promises to bring something, "standard" a stacked
+prior as well, "full" these and a transformer in any case."""
 
-NETWORKS: dict[Effort, tuple[Callable[..., Prior], ...]] = {
-    "fast": (GRUPrior,),
-    "standard": (GRUPrior, StackedPrior),
-    "full": (GRUPrior, StackedPrior, TransformerPrior),
-}
+NETWORKS: dict[str, Callable[..., Prior]] = {"gru": GRUPrior, "stacked": StackedPrior, "transformer": TransformerPrior}
 """The experts that are trained, in this order."""
+
+OF_EFFORT: dict[Effort, tuple[str, ...]] = {
+    "fast": ("gru",),
+    "standard": ("gru", "stacked"),
+    "full": ("gru", "stacked", "transformer"),
+}
 
 ORDERS = range(7)
 """Orders of the Markov chains that are tried: the best is an expert, and all are baselines in comparisons."""
@@ -57,8 +61,22 @@ DEPTH = 10
 
 def check_effort(effort: object) -> None:
     """Raise ValueError for what is no `Effort`."""
-    if effort not in list(NETWORKS):
-        raise ValueError(f"`effort` must be one of {', '.join(NETWORKS)}, got {effort!r}")
+    if effort not in list(OF_EFFORT):
+        raise ValueError(f"`effort` must be one of {', '.join(OF_EFFORT)}, got {effort!r}")
+
+
+class Experts(NamedTuple):
+    """Experts that are fitted.
+
+    Attributes:
+        fitted: the experts that count, and behind them the networks.
+        trained: the names of the networks.
+        left_out: by name, what networks promised that were not trained for it.
+    """
+
+    fitted: list[Prior]
+    trained: tuple[str, ...]
+    left_out: dict[str, Screening]
 
 
 def fitted_experts(
@@ -68,28 +86,44 @@ def fitted_experts(
     effort: Effort,
     generator: torch.Generator,
     settings: Mapping[str, Any],
-) -> Iterator[Prior]:
-    """Experts of every kind, fitted one after the other.
+    names: Sequence[str] | None = None,
+) -> Experts:
+    """Fit experts of every kind, one after the other.
 
     Args:
         learned: plans to learn from.
         held_out: plans on which orders of chains are chosen (see `counting_parts`), and networks are stopped.
         contexts: `num_contexts` or `context_size`, as experts take it that can, or none.
-        effort: which networks are trained.
+        effort: which networks there are.
         generator: draws their initial weights and the order of training.
         settings: of their training. Networks share the `seconds` that are left when all has been counted, if these are
             limited; those for which nothing is left are not trained.
+        names: of the networks that are trained; None: those that promise to bring something, see `screen`, and with
+            the full effort all.
     """
     begun, seconds = monotonic(), settings.get("seconds")
-    yield from counted(learned, held_out, contexts)
+    fitted, trained, left_out = [*counted(learned, held_out, contexts)], list[str](), dict[str, Screening]()
+    names = OF_EFFORT[effort] if names is None and effort == "full" else names
     made = networks(learned.num_actions, contexts, effort, draw_seed(generator) % 2**31)
-    for number, prior in enumerate(made):
+    made = {name: prior for name, prior in made.items() if names is None or name in names}
+    forecasts = stack_forecasts(fitted, held_out) if names is None else torch.empty(0)
+    for number, (name, prior) in enumerate(made.items()):
         if seconds is not None:
             left = (seconds - (monotonic() - begun)) / (len(made) - number)
             if left <= 0:
-                return
+                break
             settings = {**settings, "seconds": left}
-        yield prior.fit(plans_for(prior, learned), generator=generator, **{"validation": held_out, **settings})
+        if names is None:
+            promise = screen(prior, forecasts, learned, held_out, settings)
+            if not promise.pays:
+                left_out[name] = promise
+                continue
+        prior.fit(plans_for(prior, learned), generator=generator, **{"validation": held_out, **settings})
+        if names is None:
+            forecasts = torch.cat([forecasts, stack_forecasts([prior], held_out)], 2)
+        fitted.append(prior)
+        trained.append(name)
+    return Experts(fitted, tuple(trained), left_out)
 
 
 def number_tried(experts: Iterable[Prior]) -> int:
@@ -97,10 +131,10 @@ def number_tried(experts: Iterable[Prior]) -> int:
     return sum(len(ORDERS) * len(BACKOFFS_TRIED) if isinstance(e, MarkovPrior) else 1 for e in experts)
 
 
-def networks(num_actions: int, contexts: dict[str, int], effort: Effort, seed: int) -> list[Prior]:
-    """The experts of `NETWORKS`, not trained yet, with the context where they can take it."""
-    kinds = enumerate(NETWORKS[effort])
-    return [construct(kind, num_actions, contexts | {"seed": seed + number}) for number, kind in kinds]
+def networks(num_actions: int, contexts: dict[str, int], effort: Effort, seed: int) -> dict[str, Prior]:
+    """The networks of an effort by name, not trained yet, with the context where they can take it."""
+    names = enumerate(OF_EFFORT[effort])
+    return {name: construct(NETWORKS[name], num_actions, contexts | {"seed": seed + place}) for place, name in names}
 
 
 def counted(learned: Plans, held_out: Plans, contexts: dict[str, int]) -> Iterator[Prior]:

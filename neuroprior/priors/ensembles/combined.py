@@ -2,10 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from functools import cached_property
 from typing import Any, Self
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -13,7 +11,14 @@ from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.construction import as_prior, described
 from neuroprior.priors.counts import TooLargeError
-from neuroprior.priors.ensembles.candidates import Effort, check_effort, counting_parts, fitted_experts, number_tried
+from neuroprior.priors.ensembles.candidates import (
+    OF_EFFORT,
+    Effort,
+    check_effort,
+    counting_parts,
+    fitted_experts,
+    number_tried,
+)
 from neuroprior.priors.ensembles.mixture import (
     MixturePrior,
     after,
@@ -21,6 +26,13 @@ from neuroprior.priors.ensembles.mixture import (
     mixed,
     priors_in,
     weights_before,
+)
+from neuroprior.priors.ensembles.pooling import (
+    MIN_GAIN_NATS,
+    NETWORK_GAIN_NATS,
+    HeldOut,
+    stack_forecasts,
+    with_pool,
 )
 from neuroprior.priors.ensembles.stacked import context_for
 from neuroprior.priors.learning import (
@@ -36,36 +48,14 @@ from neuroprior.priors.prior import Prior, taken_of
 from neuroprior.priors.uniform import UniformPrior
 from neuroprior.sampling.states import State
 
-LEAST = -30.0
-"""Log-probabilities of experts are at least this in the pool."""
-
-TOLERANCE, IN_ALL = 5e-4, 0.1
-"""An expert is left out where the held-out loss rises by less than so many nats per action, or so many in all."""
-
 LARGEST_SPARE = 2**22
 """The most numbers in the tables of an expert that was left out and is kept aside."""
-
-NUMBERS = 2**22
-"""The most numbers of forecasts from which the powers of the pool are learned."""
-
-RIDGE = 1.0
-"""Nats that it costs when a power of the pool is 1 away from that of the experts' geometric mean."""
-
-RIDGE_OF_FEW = 5.0
-"""The same where few plans are held out, for the distance from the powers that experts which count have without
-networks, on all plans.
-"""
-
-GAIN = 4.0
-"""Where no experts are given: nats in all (or `TOLERANCE` per action, if that is more) by which held-out plans have to
-be likelier for a network to be kept, since its training was stopped where these plans were likeliest.
-"""
 
 MOST_NUMBERS = 2**25
 """The most numbers of forecasts of plans that are not held out."""
 
-STEPS, TRACKING_STEPS = 100, 5
-"""Steps of expectation maximisation, which learns the initial weights; of the fixed share for each share tried."""
+TRACKING_STEPS = 5
+"""Steps of expectation maximisation of the fixed share, for each share tried."""
 
 MOST_STEPS = 500
 """Actions of each plan from which the fixed share is learned."""
@@ -98,8 +88,10 @@ class CombinedPrior(MixturePrior):
         num_actions: A.
         experts: priors that `fit` then fits and combines; None: those that suit the plans.
         share: of the fixed share; set by `fit`.
-        effort: which networks are trained where no experts are given: "fast", a GRU alone; "standard", a stacked prior
-            as well; "full", a transformer and a switching network as well.
+        effort: which networks there are where no experts are given: "fast", a GRU; "standard", a stacked prior as well;
+            "full", a transformer as well, and all are trained.
+        networks: names of those that `fit` trains; None: those that promise to bring something after a tenth of their
+            training (`neuroprior.priors.ensembles.screening.screen`). `fit` keeps the names of them in `trained`.
         num_contexts, context_size: see `Prior`.
 
     Raises:
@@ -129,11 +121,16 @@ class CombinedPrior(MixturePrior):
         effort: Effort = "standard",
         num_contexts: int | None = None,
         context_size: int | None = None,
+        networks: Sequence[str] | None = None,
     ) -> None:
         check_effort(effort)
+        if networks is not None and (isinstance(networks, str) or set(networks) - set(OF_EFFORT[effort])):
+            raise ValueError(f"`networks` must be some of {', '.join(OF_EFFORT[effort])}, got {networks!r}")
         made = [UniformPrior(num_actions)] if experts is None else experts
         super().__init__(num_actions, made, share, num_contexts, context_size)
         self.effort: Effort = effort
+        self.networks: tuple[str, ...] | None = None if networks is None else tuple(networks)
+        self.trained: tuple[str, ...] = ()
         # `fit` begins with these each time; in a list, since each is also a submodule: kept, spare or left out.
         self.given = None if experts is None else [self._experts()]
         self.spare = nn.ModuleList()
@@ -151,13 +148,14 @@ class CombinedPrior(MixturePrior):
 
     @property
     def config(self) -> dict[str, Any]:
-        return super().config | {"effort": self.effort}
+        chosen = {} if self.networks is None else {"networks": list(self.networks)}
+        return super().config | {"effort": self.effort} | chosen
 
     @property
     def learned(self) -> dict[str, Any]:
         every = [*self.alternatives, *self.left_out]
         given = None if self.given is None else [every.index(e) for e in self.given[0]]
-        own = {"tried": self.tried, "given": given, "kept": self.config["experts"]}
+        own = {"tried": self.tried, "given": given, "kept": self.config["experts"], "trained": list(self.trained)}
         for name, some in (("spare", self.spare), ("left_out", self.left_out)):
             own[name] = [described(e) | {"learned": e.learned} for e in priors_in(some)]
         return super().learned | own
@@ -173,7 +171,7 @@ class CombinedPrior(MixturePrior):
         super().restore(learned)
         if not isinstance(learned["tried"], int) or learned["tried"] < 0:
             raise ValueError(f"`tried` must be an integer of at least 0, got {learned['tried']!r}")
-        self.tried = learned["tried"]
+        self.tried, self.trained = learned["tried"], tuple(learned.get("trained", ()))
         for name in ("spare", "left_out"):
             described_ones = learned.get(name, [])
             aside = [_restored(own.get(place + number), e) for number, e in enumerate(described_ones)]
@@ -250,8 +248,9 @@ class CombinedPrior(MixturePrior):
         else:
             sizes = {"num_contexts": self.num_contexts, "context_size": self.context_size}
             contexts = {name: size for name, size in sizes.items() if size is not None}
-            made = fitted_experts(learned, held_out, contexts, self.effort, generator, settings)
-            self.experts = nn.ModuleList(made).to(self.device)
+            made = fitted_experts(learned, held_out, contexts, self.effort, generator, settings, self.networks)
+            self.experts = nn.ModuleList(made.fitted).to(self.device)
+            self.trained = made.trained
         if self.given:
             self.learn_weights(held_out)
         else:
@@ -344,7 +343,7 @@ def _counts(expert: Prior) -> bool:
 
 def chosen_on(
     plans: Plans, learned: Plans | None, experts: Sequence[Prior], tried: int
-) -> tuple["HeldOut", list[int], Tensor]:
+) -> tuple[HeldOut, list[int], Tensor]:
     """Which experts are kept, see `CombinedPrior.learn_weights`.
 
     Returns:
@@ -352,8 +351,10 @@ def chosen_on(
     """
     costs = [e.num_weights for e in experts]
     counting = [number for number, e in enumerate(experts) if _counts(e)]
-    gains = [IN_ALL if learned is None or number in counting else GAIN for number in range(len(experts))]
-    forecasts = _forecasts(experts, plans)
+    gains = [
+        MIN_GAIN_NATS if learned is None or number in counting else NETWORK_GAIN_NATS for number in range(len(experts))
+    ]
+    forecasts = stack_forecasts(experts, plans)
     held_out = HeldOut(forecasts, plans.actions, plans.mask(), tried)
     parts = [] if learned is None or not counting else counting_parts(learned, plans)
     if len(parts) < 2 or sum(part.actions.numel() for _, part in parts) * forecasts[0, 0].numel() > MOST_NUMBERS:
@@ -362,7 +363,7 @@ def chosen_on(
     found = [(forecasts[:, :, counting], plans.actions, held_out.mask)]
     for rest, left_out in parts[1:]:
         counted = [deepcopy(experts[number]).fit(plans_for(experts[number], rest)) for number in counting]
-        found.append((_forecasts(counted, left_out), left_out.actions, left_out.mask()))
+        found.append((stack_forecasts(counted, left_out), left_out.actions, left_out.mask()))
     every, actions, mask = map(_joined, zip(*found, strict=True))
     known = HeldOut(every, actions, mask, tried)
     best, powers = known.choose([costs[number] for number in counting])
@@ -375,146 +376,10 @@ def chosen_on(
     return few.of(kept), [both[number] for number in kept], new_powers
 
 
-def _forecasts(experts: Sequence[Prior], plans: Plans) -> Tensor:
-    """`[N, L, E, A]`, the log-probabilities of all experts."""
-    each = [e.forecasts(plans_for(e, plans)) for e in experts]
-    return torch.stack([torch.cat([log_probs for _, log_probs in parts]) for parts in each], 2)
-
-
 def _joined(values: Sequence[Tensor]) -> Tensor:
     """Tensors `[N_i, L_i, ...]` as one, `[sum of N_i, max of L_i, ...]`, filled up with zeros."""
     longest = max(each.shape[1] for each in values)
     return torch.cat([torch.cat([v, v.new_zeros(len(v), longest - v.shape[1], *v.shape[2:])], 1) for v in values])
-
-
-class HeldOut:
-    """What experts forecast for held-out plans, and how they are best combined there.
-
-    Args:
-        forecasts: `[N, L, E, A]`, log-probabilities.
-        actions: `[N, L]`.
-        mask: `[N, L]` bool: the actions that count.
-        tried: how many forecasts, of experts, the pool and the fixed share, there were to choose from.
-        anchor: `[E]`, float64: the powers of the pool that are chosen where these plans say nothing; None: those of the
-            geometric mean.
-    """
-
-    def __init__(
-        self, forecasts: Tensor, actions: Tensor, mask: Tensor, tried: int, anchor: Tensor | None = None
-    ) -> None:
-        self.forecasts, self.actions, self.mask, self.tried, self.anchor = forecasts, actions, mask, tried, anchor
-        self.taken = taken_of(forecasts, actions).masked_fill(~mask[..., None], 0)
-        self.count = max(int(mask.sum()), 1)
-        # Some actions, evenly spread, are enough for a few powers.
-        self.every = -(-self.count * forecasts[0, 0].numel() // NUMBERS)
-
-    @cached_property
-    def sample(self) -> Tensor:
-        """`[M, E, A]`, float64: the log-probabilities at some of the actions that count."""
-        return self.forecasts[self.mask][:: self.every].double().clamp(min=LEAST)
-
-    @cached_property
-    def sample_actions(self) -> Tensor:
-        """`[M]`: these actions."""
-        return self.actions[self.mask][:: self.every].long()
-
-    def of(self, kept: list[int], anchor: Tensor | None = None) -> "HeldOut":
-        """The same of some experts, whose anchor is this one's, or `anchor`."""
-        if anchor is None and self.anchor is not None:
-            anchor = self.anchor[kept]
-        return HeldOut(self.forecasts[:, :, kept], self.actions, self.mask, self.tried, anchor)
-
-    def tolerance(self, gain: float = IN_ALL) -> float:
-        """Nats per action that do not count, where `gain` nats in all do not."""
-        return max(TOLERANCE, gain / self.count)
-
-    def choose(
-        self, costs: Sequence[int], gains: Sequence[float] | None = None, fixed: int = 0
-    ) -> tuple[list[int], Tensor]:
-        """The experts that are kept, and their powers `[K]`, float64, in the pool.
-
-        One expert after the other is left out: the dearest of those without which no more is lost than it has to add.
-
-        Args:
-            costs: of each expert, such as its number of weights. (Seconds differ from run to run, and so would what is
-                chosen.)
-            gains: nats in all by which these plans have to be likelier with each, see `tolerance`; None: `IN_ALL`.
-            fixed: the first so many are kept.
-        """
-        kept, gains = list(range(len(costs))), gains or [IN_ALL] * len(costs)
-        powers, best = self.combined(kept)
-        since = best  # the least loss since an expert went that had to add more: what the others add is judged by it
-        while len(kept) > 1:
-            found = []
-            for out in kept[fixed:]:
-                rest = [number for number in kept if number != out]
-                rest_powers, loss = self.combined(rest)
-                best, since = min(best, loss), min(since, loss)
-                found.append((out, loss, rest, rest_powers))
-            least = {out: best if gains[out] > IN_ALL else since for out, *_ in found}
-            spared = [entry for entry in found if entry[1] <= least[entry[0]] + self.tolerance(gains[entry[0]])]
-            if not spared:
-                break
-            # The dearest; among those that count, which cost the same, the one that is missed least.
-            gone, loss, kept, powers = max(spared, key=lambda entry: (costs[entry[0]], -entry[1]))
-            since = loss if gains[gone] > IN_ALL else since
-        return kept, powers
-
-    def combined(self, kept: list[int]) -> tuple[Tensor, float]:
-        """The powers of some experts in their pool, and the loss of the mixture of these and the pool."""
-        powers = self.powers(self.sample[:, kept], None if self.anchor is None else self.anchor[kept])
-        pooled = with_pool(self.forecasts[:, :, kept], powers)[:, :, -1:]
-        taken = taken_of(pooled, self.actions).masked_fill(~self.mask[..., None], 0)
-        return powers, self.loss(torch.cat([self.taken[:, :, kept], taken], 2))
-
-    def powers(self, forecasts: Tensor, anchor: Tensor | None = None) -> Tensor:
-        """The powers `[K]` of the pool under which some actions are likeliest, of `forecasts [M, K, A]`.
-
-        With a price for their distance from the `anchor [K]`; None: from those of the geometric mean.
-        """
-        from scipy.optimize import minimize  # takes a second to import: only where it is needed
-
-        size, ridge = forecasts.shape[1], RIDGE if anchor is None else RIDGE_OF_FEW
-        first = torch.full((size,), 1 / size, dtype=torch.double) if anchor is None else anchor.cpu()
-
-        def loss(values: np.ndarray[Any, Any]) -> tuple[float, np.ndarray[Any, Any]]:
-            now = torch.tensor(values, device=forecasts.device)
-            log_probs = torch.einsum("mka,k->ma", forecasts, now).log_softmax(-1)
-            taken = log_probs.gather(1, self.sample_actions[:, None]).sum()
-            # The gradient: what was forecast of the action taken, less what the pool expects.
-            chosen = forecasts.gather(2, self.sample_actions[:, None, None].expand(-1, size, 1))[..., 0].sum(0)
-            slope = torch.einsum("mka,ma->k", forecasts, log_probs.exp()) - chosen
-            away = now - first.to(now)
-            return float(ridge * (away**2).sum() - taken), (slope + 2 * ridge * away).cpu().numpy()
-
-        found = minimize(loss, first.numpy(), jac=True, method="L-BFGS-B", bounds=[(0, None)] * size)
-        return torch.tensor(found.x, device=forecasts.device)
-
-    def loss(self, taken: Tensor) -> float:
-        """Nats per action of the Bayesian mixture of forecasts, from those of the actions taken, `[N, L, K]`."""
-        totals = taken.sum(1)
-        return -float((self.initial_weights(totals) + totals.double()).logsumexp(-1).sum()) / self.count
-
-    def initial_weights(self, totals: Tensor) -> Tensor:
-        """The logarithms `[K]` of the weights, of 1 / `tried` at least, under which plans are likeliest.
-
-        Args:
-            totals: `[N, K]`, the log-probability of each plan under each forecast.
-        """
-        totals, size = totals.double(), totals.shape[1]
-        least, free = 1 / self.tried, 1 - size / self.tried
-        share = totals.new_full((size,), 1 / size)
-        for _ in range(STEPS):
-            weights = least + free * share
-            earned = (weights.log() + totals).softmax(-1) * (free * share / weights)
-            share = earned.sum(0) / earned.sum().clamp(min=1e-300)
-        return (least + free * share).log().log_softmax(-1)
-
-
-def with_pool(forecasts: Tensor, powers: Tensor) -> Tensor:
-    """Log-probabilities `[..., E, A]`, and behind them their pool's, `[..., E + 1, A]`."""
-    pooled = torch.einsum("...ea,e->...a", forecasts.clamp(min=LEAST), powers.to(forecasts)).log_softmax(-1)
-    return torch.cat([forecasts, pooled[..., None, :]], -2)
 
 
 def _restored(own: Prior | None, description: Mapping[str, Any]) -> Prior:

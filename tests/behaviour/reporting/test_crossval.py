@@ -25,8 +25,9 @@ from neuroprior.behaviour.reporting.fits import (
 from neuroprior.behaviour.reporting.scores import Evaluation, cross_validation, evaluate, jobs
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import folds, in_parts
-from neuroprior.priors import ContextTreePrior, GRUPrior, MarkovPrior, Prior, StackedPrior
+from neuroprior.priors import ContextTreePrior, GRUPrior, MarkovPrior, StackedPrior
 from neuroprior.priors.counts import BACKOFFS_TRIED
+from neuroprior.priors.ensembles.candidates import Experts
 from tests.support.chains import markov_plans, markov_probs
 from tests.support.sources import refuses, seeded
 
@@ -163,8 +164,9 @@ def test_features_are_for_neural_models_alone(kind, tmp_path):
 def test_the_combined_prior_learns_its_weights_on_plans_that_its_experts_did_not_see(monkeypatch):
     """Actions are independent; a chain of order 6 knows by heart the plans that it counted, and no others."""
 
-    def experts(learned: Plans, *others: object) -> list[Prior]:
-        return [ContextTreePrior(3, 0).fit(learned), MarkovPrior(3, 6, 0.01, backoff="dirichlet").fit(learned)]
+    def experts(learned: Plans, *others: object) -> Experts:
+        large = MarkovPrior(3, 6, 0.01, backoff="dirichlet")
+        return Experts([ContextTreePrior(3, 0).fit(learned), large.fit(learned)], (), {})
 
     monkeypatch.setattr(fits, "fitted_experts", experts)
     drawn = torch.multinomial(torch.tensor([0.7, 0.2, 0.1]), 480, True, generator=seeded(0)).view(60, 8)
@@ -288,10 +290,10 @@ def test_the_networks_among_experts_are_counted_again_on_all_that_is_learned(mon
     """The stacked prior learned its weights beside validation plans; its counts are then those of all plans."""
     made = []
 
-    def experts(learned: Plans, *others: object) -> list[StackedPrior]:
+    def experts(learned: Plans, *others: object) -> Experts:
         stacked = StackedPrior(3).fit(learned, max_steps=1, progress=False, generator=seeded(0))
         made.append((stacked, stacked.action_log_probs(test)))
-        return [stacked]
+        return Experts([stacked], ("stacked",), {})
 
     plans, test = drawn(20, 6), drawn(4, 6, seed=1)
     monkeypatch.setattr(fits, "fitted_experts", experts)

@@ -15,6 +15,8 @@ from neuroprior.behaviour.reporting.document import Document
 from neuroprior.behaviour.reporting.options import FitOptions, ReadOptions
 from neuroprior.behaviour.reporting.plan_report import report
 from neuroprior.priors import MarkovPrior, UniformPrior, save
+from neuroprior.priors.ensembles import candidates
+from neuroprior.priors.ensembles.screening import Screening
 from neuroprior.priors.scoring import keep_learned
 from tests.support.chains import markov_plans, markov_probs
 from tests.support.reports import QUICK, QUICK_IN_TWO
@@ -193,3 +195,22 @@ def test_recordings_have_a_time_budget_and_a_reference(tmp_path):
         "mean, saline",
         "mean, drug",
     ]
+
+
+@pytest.mark.parametrize(("pays", "named"), [(False, False), (True, False), (False, True)])
+def test_networks_are_trained_where_they_pay_or_are_named(pays, named, monkeypatch):
+    """Screened, they are tried in the first fold alone; what they promised is said."""
+    asked = list[int]()
+
+    def screened(*args: Any) -> Screening:
+        asked.append(len(args[2]))
+        return Screening(0.0, 0.0, -1.0 if pays else 1.0)
+
+    monkeypatch.setattr(candidates, "screen", screened)
+    models = ["counts", "gru", "combined"] if named else None
+    made = report(chain(20), sections=["scores"], fits=FitOptions(models=models, folds=3, max_steps=1, processes=1))
+    found, text = set(made.frames["plans"]["model"]), " ".join(made.sections[0].text)
+    assert ("gru" in found) == (pays or named)
+    assert ("transformer" in found) == pays
+    assert ("Not trained: gru, stacked, transformer." in text) == (not pays and not named)
+    assert len(asked) == (0 if named else 2)

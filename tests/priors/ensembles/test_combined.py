@@ -2,7 +2,7 @@
 
 import json
 import math
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -26,8 +26,8 @@ from neuroprior import (
 )
 from neuroprior.priors import MixturePrior, StackedPrior
 from neuroprior.priors.counts import BACKOFFS_TRIED, Chains, TooLargeError
-from neuroprior.priors.ensembles.candidates import ORDERS, best_chain
-from neuroprior.priors.ensembles.combined import HeldOut
+from neuroprior.priors.ensembles.candidates import OF_EFFORT, ORDERS, best_chain
+from neuroprior.priors.ensembles.pooling import HeldOut
 from neuroprior.testing import check_prior
 from tests.support.sources import every_plan, refuses, seeded
 
@@ -499,7 +499,8 @@ def test_effort_says_which_networks_are_trained(effort, kinds, few_orders, monke
 
     for kind in (GRUPrior, StackedPrior, TransformerPrior):
         record(kind)
-    prior = neuroprior.fit(some_plans(contexts=True), effort=effort, generator=seeded(0), **QUICK)
+    made = partial(CombinedPrior, effort=effort, networks=OF_EFFORT[effort])
+    prior = neuroprior.fit(some_plans(contexts=True), made, generator=seeded(0), **QUICK)
     assert isinstance(prior, CombinedPrior)
     assert prior.num_contexts == C
     assert set(trained) == kinds

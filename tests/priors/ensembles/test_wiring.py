@@ -11,8 +11,8 @@ from neuroprior.priors import MixturePrior, StackedPrior
 from neuroprior.priors.counts import BACKOFFS_TRIED, Chains, HistoryPrior
 from neuroprior.priors.ensembles import stacked
 from neuroprior.priors.ensembles.candidates import NETWORKS, ORDERS, best_chain, counting_parts, fitted_experts
-from neuroprior.priors.ensembles.combined import HeldOut
 from neuroprior.priors.ensembles.mixture import SHARES
+from neuroprior.priors.ensembles.pooling import HeldOut
 from neuroprior.priors.learning import split_validation
 from tests.support.sources import seeded
 
@@ -63,10 +63,13 @@ def test_experts_get_the_plans_and_settings_that_are_theirs(kind, given):
 
 
 def test_networks_of_a_combined_prior_have_seeds_of_their_own_and_are_stopped_on_held_out_plans(monkeypatch):
-    monkeypatch.setitem(NETWORKS, "fast", (Recorder, Recorder))
+    for name in ("gru", "stacked"):
+        monkeypatch.setitem(NETWORKS, name, Recorder)
     learned, held_out, generator = some_plans(), some_plans(8), seeded(1)
     made = [
-        e for e in fitted_experts(learned, held_out, {}, "fast", generator, {"max_steps": 7}) if type(e) is Recorder
+        e
+        for e in fitted_experts(learned, held_out, {}, "full", generator, {"max_steps": 7}, ["gru", "stacked"]).fitted
+        if type(e) is Recorder
     ]
     assert len({expert.seed for expert in made}) == len(made) == 2
     for expert in made:
