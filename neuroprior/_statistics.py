@@ -224,3 +224,10 @@ def _vector(name: str, values: ArrayLike) -> np.ndarray[tuple[int], np.dtype[np.
     if len(wrong):
         raise ValueError(f"`{name}[{wrong[0]}]` must be a number, got nan.")
     return vector
+
+
+def p_words(value: float) -> str:
+    """Return a p-value for a sentence: "p = .012", "p < .0001"."""
+    if value < 1e-4:
+        return "p < .0001"
+    return f"p = {value:.2g}".replace("0.", ".", 1)

@@ -16,7 +16,7 @@ from scipy.special import stdtrit
 from torch import Tensor
 
 from neuroprior._checks import check_sizes
-from neuroprior._statistics import ENOUGH_UNITS, LEVEL, Difference, holm, ratio_difference
+from neuroprior._statistics import ENOUGH_UNITS, LEVEL, Difference, holm, p_words, ratio_difference
 from neuroprior.behaviour.analysis.condition_chains import SMOOTHING, ConditionChains
 from neuroprior.behaviour.analysis.flat import FlatPlans, ranks
 from neuroprior.behaviour.analysis.interaction import ConditionInteraction, compare_strata
@@ -544,6 +544,6 @@ def _verdict(
         return f"{units[0].upper()}{units[1:]} are too few for a verdict."
     between = f"between {names[0]} and {names[1]}" if len(names) == 2 else f"between the {len(names)} conditions"
     if p_value >= LEVEL:
-        return f"No difference {between} was found (p = {p_value:.2g}, corrected). {power}."
+        return f"No difference {between} was found ({p_words(p_value)}, corrected). {power}."
     where = listed([name for name, (_, corrected) in tests.items() if corrected < LEVEL])
-    return f"Behaviour differs {between} (p = {p_value:.2g}), by the tests of {where} (corrected)."
+    return f"Behaviour differs {between} ({p_words(p_value)}), by the tests of {where} (corrected)."

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import pandas as pd
 import torch
 
-from neuroprior._statistics import LEVEL
+from neuroprior._statistics import LEVEL, p_words
 from neuroprior.behaviour.analysis.conditions import (
     ConditionComparison,
     ConditionFamily,
@@ -17,7 +17,7 @@ from neuroprior.behaviour.analysis.interaction import ConditionInteraction
 from neuroprior.behaviour.recorded_plans import action_names, group_names
 from neuroprior.behaviour.reporting import figures
 from neuroprior.behaviour.reporting.document import Column, table
-from neuroprior.behaviour.reporting.findings import Finding, p_words
+from neuroprior.behaviour.reporting.findings import Finding
 from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
 from neuroprior.behaviour.reporting.part import LISTED, Part, p_text
 from neuroprior.behaviour.reporting.scores import Evaluation
@@ -326,7 +326,7 @@ def _block_table(result: ConditionComparison, prediction: ConditionPrediction, b
     caption = (
         f"Held-out {item}, under the condition in which their sequences are most likely (Markov chains):"
         f" {100 * prediction.accuracy:.0f} % are right on average over conditions, {100 * prediction.expected:.0f} % in"
-        f" permutations (p = {prediction.p_value:.2g}, not corrected)."
+        f" permutations ({p_words(prediction.p_value)}, not corrected)."
     )
     return table(counts, columns, caption, "Condition predicted from sequences")
 

@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from neuroprior._statistics import p_words
+
 MOST_SENTENCES = 8
 """At the top of a report."""
 
@@ -50,7 +52,7 @@ def gain_finding(family: str, feature: str, what: str, row: Mapping[Any, Any]) -
     """The finding that `what` adds bits: of a row with `bits, low, high, p_value, corrected, starred`."""
     bits, low, high, p, corrected = (float(row[name]) for name in ("bits", "low", "high", "p_value", "corrected"))
     sentence = (
-        f"{what} adds {bits:.3g} bits to the prediction of the next one, 95 % interval {low:.3g} to {high:.3g};"
+        f"{what} adds {bits:.2g} bits to the prediction of the next one, 95 % interval {low:.2g} to {high:.2g};"
         f" {p_words(corrected)}."
     )
     return Finding(feature, family, feature, bits, low, high, p, corrected, bool(row["starred"]), sentence)
@@ -84,10 +86,3 @@ def headline(verdicts: Sequence[str], sections: Sequence[Sequence[Finding]]) -> 
     if rest := sorted({*places} - {*kept}, key=lambda place: place[::-1]):
         said.append(Sentence(f"Starred, too: {'; '.join(starred[number][rank].feature for rank, number in rest)}."))
     return said
-
-
-def p_words(value: float) -> str:
-    """A p-value in a sentence: "p = .012", "p < .0001"."""
-    if value < 1e-4:
-        return "p < .0001"
-    return f"p = {value:.2g}".replace("0.", ".", 1)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.cluster.hierarchy import dendrogram, linkage
 from scipy.spatial.distance import squareform
 
-from neuroprior._statistics import ENOUGH_UNITS, LEVEL
+from neuroprior._statistics import ENOUGH_UNITS, LEVEL, p_words
 from neuroprior.behaviour.analysis.comparison import too_few
 from neuroprior.behaviour.analysis.individuality import Individuality, individuality
 from neuroprior.behaviour.analysis.individuals import (
@@ -37,7 +37,7 @@ from neuroprior.behaviour.reporting.drawing import (
     short,
 )
 from neuroprior.behaviour.reporting.figures import OTHER
-from neuroprior.behaviour.reporting.findings import Finding, p_words
+from neuroprior.behaviour.reporting.findings import Finding
 from neuroprior.behaviour.reporting.page import INK, FigureBox, Section, Table
 from neuroprior.behaviour.reporting.part import LISTED, Part, without_verdict
 from neuroprior.behaviour.reporting.scores import Evaluation

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from neuroprior._statistics import LEVEL
+from neuroprior._statistics import LEVEL, p_words
 from neuroprior.behaviour.durations.survival import DurationSurvival
 from neuroprior.behaviour.reporting.document import Column, table
 from neuroprior.behaviour.reporting.drawing import (
@@ -21,7 +21,7 @@ from neuroprior.behaviour.reporting.drawing import (
     panels,
     short,
 )
-from neuroprior.behaviour.reporting.findings import Finding, p_words
+from neuroprior.behaviour.reporting.findings import Finding
 from neuroprior.behaviour.reporting.page import Table
 from neuroprior.behaviour.reporting.part import LISTED, p_text
 from neuroprior.plans.columns import listed
