@@ -35,7 +35,7 @@ WORTH = 0.005
 TEST_PLANS = 3000
 """Plans of each source on which gains are measured."""
 
-STUDIES = {"example study": simulated_study, "large study": large_study}
+STUDIES = {"example study": simulated_study, "large study": lambda seed: large_study(seed).query("observer == 'A'")}
 
 LABYRINTH = {"labyrinth": False, "labyrinth with node": True}
 """The mice's moves, without and with the node as context."""

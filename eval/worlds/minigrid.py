@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuroprior.worlds import EpisodicWorld, from_gymnasium
+from neuroprior.worlds import EpisodicWorld, Features, from_gymnasium
 
 MOVES = ("left", "right", "forward", "pickup", "drop", "toggle", "done")
 """MiniGrid's actions in the order of their numbers."""
@@ -46,6 +46,7 @@ def layouts(environment: str, seeds: range) -> EpisodicWorld:
     assert isinstance(world, EpisodicWorld)
     assert world.features is not None
     world.features = square_features(world.features)
+    world.observation = Features(world.features.shape[1])
     return world
 
 

@@ -1,13 +1,17 @@
 """The experts of a combined prior: which are tried on plans of a kind, and what is spent on them."""
 
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from copy import deepcopy
+from functools import partial
 from math import inf
 from time import monotonic
 from typing import Any, Literal, NamedTuple
 
 import torch
 
+from neuroprior._jobs import saying
 from neuroprior._random import draw_seed
 from neuroprior.plans.folds import divisible, folds, in_parts, num_units, pieces, ungrouped
 from neuroprior.plans.plans import Plans
@@ -102,7 +106,10 @@ def fitted_experts(
             the full effort all.
     """
     begun, seconds = monotonic(), settings.get("seconds")
-    fitted, trained, left_out = [*counted(learned, held_out, contexts)], list[str](), dict[str, Screening]()
+    tell = partial(print, file=sys.stderr, flush=True) if settings.get("progress", True) else lambda line: None
+    with saying("counting chains and trees") if settings.get("progress", True) else nullcontext():
+        fitted = [*counted(learned, held_out, contexts)]
+    trained, left_out = list[str](), dict[str, Screening]()
     names = OF_EFFORT[effort] if names is None and effort == "full" else names
     made = networks(learned.num_actions, contexts, effort, draw_seed(generator) % 2**31)
     made = {name: prior for name, prior in made.items() if names is None or name in names}
@@ -117,6 +124,7 @@ def fitted_experts(
             promise = screen(prior, forecasts, learned, held_out, settings)
             if not promise.pays:
                 left_out[name] = promise
+                tell(f"{name}: not trained, as it promises {promise.gain:.4f} of {promise.needed:.4f} nats per action")
                 continue
         prior.fit(plans_for(prior, learned), generator=generator, **{"validation": held_out, **settings})
         if names is None:
