@@ -143,6 +143,13 @@ def check_flags(**flags: object) -> None:
             raise ValueError(f"`{name}` must be True or False, got {flag!r}")
 
 
+def check_choices(name: str, given: object, known: Sequence[str], least: int = 1) -> None:
+    """Raise ValueError unless `given` are at least so many of the names that are known."""
+    some = given if isinstance(given, Sequence) and not isinstance(given, str) else None
+    if some is None or len(some) < least or any(one not in list(known) for one in some):
+        raise ValueError(f"`{name}` must be a list of some of {', '.join(known)}, got {given!r}.")
+
+
 def check_share(name: str, share: object) -> None:
     """Raise ValueError, naming the argument, unless it is a number from 0 to 1."""
     if not is_number(share) or not 0 <= share <= 1:

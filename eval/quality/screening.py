@@ -87,11 +87,12 @@ def rows_of(job: Job, num_sequences: int) -> list[dict[str, Any]]:
     learned, held_out = split_validation(plans, None, torch.Generator().manual_seed(job.seed))
     contexts, settings = context_arguments(plans), {"progress": False}
     experts = list(counted(learned, held_out, contexts))
-    forecasts, of_test = stack_forecasts(experts, held_out), stack_forecasts(experts, test)
-    rows = []
+    counts, of_test = stack_forecasts(experts, held_out), stack_forecasts(experts, test)
+    forecasts, rows = counts, []
     for network in networks(plans.num_actions, contexts, "standard", job.seed + 1).values():
         begun = time.perf_counter()
-        promise = screen(network, forecasts, learned, held_out, settings)
+        promise = screen(network, counts, learned, held_out, settings)
+        assert promise is not None  # a training of a thousand steps is long enough
         screened, trained = time.perf_counter(), deepcopy(network)
         generator = torch.Generator().manual_seed(job.seed)
         trained.fit(plans_for(trained, learned), generator=generator, validation=held_out, **settings)
@@ -157,8 +158,8 @@ def _document(frame: pd.DataFrame, settings: dict[str, Any]) -> Document:
         "training, s": "training_seconds:.0f",
     }
     caption = (
-        "Nats per action. promised: on held-out plans, expected from a tenth of the training. needed: to be kept there."
-        " gain: of the trained network, on plans that nothing was chosen on, beside the experts before it."
+        "Nats per action. promised: beyond counts on held-out plans, after a tenth of the training. needed: to be kept"
+        " there. gain: of the trained network, on other plans, beyond counts and the networks trained before it."
     )
     tables = [table(frame, columns, caption)]
     return Document("Screening of networks", lead, [Section("Networks", tables=tables)], {"screening": frame}, settings)

@@ -182,6 +182,10 @@ def fit(
     try:
         made = make_prior(parts.plans, partial(prior, **arguments), use_context)
     except TypeError as error:
+        if "'effort'" in str(error):
+            raise ValueError(
+                f"`effort` must be left out for another prior than the combined one, got {effort}."
+            ) from error
         raise ValueError(
             f"`prior` must take what it is given: {error}; --use_context false leaves the context out."
         ) from error

@@ -25,6 +25,9 @@ PSEUDO_COUNTS = 4.0 ** np.arange(-6, 9)
 MIN_GAIN = 5e-4
 """Bits of a gain that count as none: a longer history that says nothing still smooths a little better."""
 
+FIRST_SHARE = 0.8
+"""Share of the level that is spent on the first lag; the others share the rest."""
+
 WORDS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight")
 ORDINALS = ("the last", "a second", "a third", "a fourth", "a fifth", "a sixth", "a seventh", "an eighth")
 
@@ -37,9 +40,11 @@ class HowFarBack:
 
     Attributes:
         gains: K: bits per held-out action, with the 95 % interval over units and the p-value of 0.
-        corrected: float64 `[K]`: the p-value of a gain above `MIN_GAIN` at this lag and all before it. Lags are tested
-            in their order, up to the first without a gain, so that no further correction is needed.
-        reach: the last lag before the first whose corrected p-value is not below `LEVEL`.
+        corrected: float64 `[K]`: the p-value of a gain above `MIN_GAIN`, corrected for the number of lags by the
+            fallback procedure (Wiens and Dmitrienko 2005): most of the level is spent on the first lag, and handed on
+            from each lag that adds to the next. So a lag is found, too, that adds where nearer ones do not, such as one
+            of two actions that matter only together.
+        reach: the last lag whose corrected p-value is below `LEVEL`.
         unit: what intervals are over, such as "subjects".
         num_units: how many there are.
         few: why no verdict is drawn; "" where one is.
@@ -75,7 +80,7 @@ class HowFarBack:
 
         frame = pd.DataFrame(self.gains).rename(columns={"mean": "bits"})
         frame.insert(0, "lag", np.arange(len(frame)) + 1)
-        adds = (frame["lag"] <= self.reach) & (self.few == "")
+        adds = (self.corrected < LEVEL) & (self.few == "")
         return frame.assign(corrected=self.corrected, units=self.num_units, adds=adds)
 
 
@@ -135,9 +140,27 @@ def how_far_back(plans: Plans, max_lag: int = 4, skip: int = 0) -> HowFarBack:
         more = ratio_difference(gain - MIN_GAIN * size, size)
         above.append(more.p_value if more.mean > 0 else 1.0)
         bits = better
-    corrected = np.maximum.accumulate(above)
-    reach, few = int((corrected < LEVEL).sum()), too_few(plans, later)
+    corrected, few = _fallback(np.array(above)), too_few(plans, later)
+    reach = int(np.flatnonzero(corrected < LEVEL).max(initial=-1)) + 1
     return HowFarBack(gains, corrected, reach, unit_name(plans, later), int(unit.max()) + 1, few)
+
+
+def _fallback(p_values: Array) -> Array:
+    """Return the p-values `[K]` corrected by the fallback procedure: the least overall levels at which they pass."""
+    size = len(p_values)
+    shares = np.full(size, (1 - FIRST_SHARE) / max(size - 1, 1))
+    shares[0] = FIRST_SHARE if size > 1 else 1.0
+    ends = [(first, last) for last in range(size) for first in range(last + 1)]
+    levels = sorted(p_values[last] / shares[first : last + 1].sum() for first, last in ends)
+    corrected = np.ones(size)
+    for level in reversed(levels):
+        spent = 0.0  # on a lag: its share of the level, and all that is handed on by those before it that pass
+        for lag, p_value in enumerate(p_values):
+            spent += level * shares[lag]
+            passes = p_value <= spent * (1 + 1e-12)
+            corrected[lag] = min(level, 1.0) if passes else corrected[lag]
+            spent = spent if passes else 0.0
+    return corrected
 
 
 def actions_in_a_row(plans: Plans) -> tuple[Array, Array, Array]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Literal
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_choices, check_sizes
 from neuroprior.behaviour.reading import Options
 from neuroprior.behaviour.reading.read import read_recordings
 from neuroprior.behaviour.recorded_plans import RecordedPlans
@@ -15,13 +15,12 @@ from neuroprior.plans import Plans, constant_context, read_plans
 from neuroprior.plans.columns import check_names
 from neuroprior.plans.io import MINARI
 from neuroprior.plans.io.npz import read_npz
-from neuroprior.priors.ensembles.candidates import Effort, check_effort
+from neuroprior.priors.ensembles.candidates import OF_EFFORT, Effort, check_effort
 
 ModelName = Literal["counts", "gru", "transformer", "stacked", "combined"]
 InputName = Literal["actions", "context", "durations"]
 
 MODELS: tuple[ModelName, ...] = ("counts", "gru", "transformer", "stacked", "combined")
-QUICK: tuple[ModelName, ...] = ("counts", "gru", "combined")
 INPUTS: tuple[InputName, ...] = ("actions", "context", "durations")
 
 MAX_SEED = 2**50 - 1
@@ -138,15 +137,15 @@ class FitOptions:
 
     Attributes:
         models: which to fit: counts (uniform, Markov chains, context trees), gru, transformer, stacked (a GRU that
-            weighs the forecasts of counts), combined (of what `effort` says, which is fitted for it). None: all; with
-            effort fast counts, gru and combined.
+            weighs the forecasts of counts), combined (of what `effort` says, which is fitted for it). None: counts and
+            combined, and of the networks those that promise to pay, with full effort all.
         inputs: of the models: past actions alone; the context as well, where the plans have one; of gru, transformer
             and combined, durations: how long the last action took, beside the actions. Each in turn; durations, with
             which these take as long again, are left out by default.
         modes: numbers of hidden modes that are tried, such as `[1, 2, 3]`; None: no section on modes, which takes about
             as long for each number as the counts.
-        effort: how much the combined prior spends on networks: fast (a GRU), standard (and a stacked prior) or full
-            (and a transformer and a switching network).
+        effort: which networks there are: fast (a GRU), standard (and a stacked prior) or full (and a transformer, and
+            all are trained).
         folds: of the cross-validation over groups (over plans, where there are no two groups); None: 5, or fewer where
             there are fewer groups.
         max_steps: gradient steps of a neural prior; None: by the plans, see `neuroprior.training.Settings`.
@@ -159,7 +158,7 @@ class FitOptions:
 
     Example:
         >>> FitOptions(effort="fast").kinds
-        ('counts', 'gru', 'combined')
+        ['counts', 'combined', 'gru']
     """
 
     models: Sequence[ModelName] | None = None
@@ -187,18 +186,11 @@ class FitOptions:
 
     @property
     def kinds(self) -> Sequence[ModelName]:
-        """Returns the models to fit."""
-        if self.models is not None:
-            return self.models
-        return QUICK if self.effort == "fast" else MODELS
+        """Returns the models to fit; the networks are those of the combined prior."""
+        networks = [name for name in MODELS if name in OF_EFFORT[self.effort]]
+        return ["counts", "combined", *networks] if self.models is None else self.models
 
     def changed(self) -> list[str]:
         """Returns the names of the options that have another value than by default, but for those of the machine."""
         named = (field for field in fields(self) if field.name not in ("seed", "processes", "dask"))
         return [field.name for field in named if getattr(self, field.name) != field.default]
-
-
-def check_choices(name: str, given: Sequence[str], known: Sequence[str]) -> None:
-    """Raises ValueError unless all are known, and there is one at least."""
-    if isinstance(given, str) or not given or set(given) - set(known):
-        raise ValueError(f"`{name}` must be a list of some of {', '.join(known)}, got {given!r}.")

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from neuroprior._checks import check_count
+from neuroprior._checks import check_choices, check_count
 from neuroprior._jobs import Progress, in_words, saying
 from neuroprior._threads import one_thread
 from neuroprior.behaviour.durations.past_durations import PastDurations
@@ -30,13 +30,13 @@ from neuroprior.behaviour.reporting.fits import (
     Design,
     Job,
     counted,
+    split,
     trained_networks,
 )
 from neuroprior.behaviour.reporting.options import (
     Files,
     FitOptions,
     ReadOptions,
-    check_choices,
     is_recording,
     name_files,
 )
@@ -49,7 +49,7 @@ from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
 from neuroprior.plans.plans import AnyPlans
 from neuroprior.priors import Prior, load
 from neuroprior.priors.matching import learned_names, renumbered
-from neuroprior.priors.scoring import learned_from
+from neuroprior.priors.scoring import learned_from, plan_digests
 
 MOST_ACTIONS = 10_000
 """Kinds of actions beyond which they are thought to be names that look like numbers."""
@@ -59,6 +59,9 @@ KEYS = {"plans": "rows"}
 
 SECONDS_A_STATUS = 60
 """How often the page says anew how long networks take."""
+
+LONG_ENOUGH = 20
+"""Actions from which on equal plans are thought to be the same one."""
 
 FOLDS = 5
 """Folds where their number is not given; fewer where there are fewer groups."""
@@ -144,9 +147,11 @@ def report(
             if out is not None:
                 _write(document, Path(out), figures)
             each(document)
-    except KeyboardInterrupt:
+    except BaseException as error:
         if document is not None and out is not None:
-            stopped = "Interrupted: models or modes are missing. The same command goes on."
+            interrupted = isinstance(error, KeyboardInterrupt)
+            why = "Interrupted" if interrupted else f"Stopped by an error ({error})"
+            stopped = f"{why}: models or modes are missing." + " The same command goes on." * interrupted
             _write(replace(document, status=stopped), Path(out), figures)
         raise
     assert document is not None
@@ -212,7 +217,7 @@ def _cross_validate(
         other, cut = _in_parts(other)
     scored = learned if other is None else other
     number = 1 if other is not None else _folds(_name(plans), learned, fits)
-    screened = fits.models is None and fits.effort != "full"
+    screened = fits.models is None and fits.effort != "full" and "durations" not in fits.inputs
     design = Design(number, fits.seed, skip, fits.max_steps, fits.effort, cut=cut, screened=screened)
     kinds: list[str] = [*fits.kinds]
     if with_lags:
@@ -223,7 +228,13 @@ def _cross_validate(
         raise ValueError(
             f"`skip` must leave at least {FEWEST_UNITS} actions to score, got {skip}, which leaves {scorable}."
         )
+    fewest = min(int(split(learned, other, design, fold)[0].mask().sum()) for fold in range(number))
+    if fewest < 2 * FEWEST_UNITS:
+        raise ValueError(
+            f"{_name(plans)}: at least {2 * FEWEST_UNITS} actions to learn from are needed in each fold, got {fewest}"
+        )
     settings: dict[str, Any] = {"models": ", ".join(kinds)}
+    again = 0 if other is None else _learned_again(whole, other)
     todo = jobs(design, kinds, inputs)
     counts, networks = ([job for job in todo if (job.kind in COUNTS) == first] for first in (True, False))
 
@@ -232,6 +243,7 @@ def _cross_validate(
         more: dict[str, Any] = {} if fits.modes is None else {"modes": sorted(set(fits.modes))}
         more |= {"sequences without behaviours, left out": empty} if empty else {}
         more |= {} if test is None else {"test": _name(test)}
+        more |= {"training data": {"each model": again}} if again else {}
         return replace(found, plans=whole, settings=settings | found.settings | more)
 
     def fitting(some: list[Job]) -> Iterator[_Stage]:
@@ -266,6 +278,12 @@ def _cross_validate(
             yield _Stage(found, (*OF_MODELS, *["durations"] * (DURATIONS in inputs)), _still(*later[1:]))
         if modes:
             yield _Stage(found, ("modes",), "")
+
+
+def _learned_again(learned: Plans, test: Plans) -> int:
+    """How many test plans are among those that are learned from, but for short ones, which may be equal by chance."""
+    known, long = set(plan_digests(learned)), (test.mask().sum(1) >= LONG_ENOUGH).tolist()
+    return sum(digest in known for digest, counts in zip(plan_digests(test), long, strict=True) if counts)
 
 
 def _still(*later: str) -> str:
@@ -338,7 +356,7 @@ def _scored(found: Evaluation) -> list[str]:
         return []
     learned = found.settings.get("training data", {})
     same = "; ".join(
-        f"{name} has learned from {number:,} of the {len(found.plans):,} sequences" for name, number in learned.items()
+        f"{name} has learned from {number:,} of the {len(found.scored):,} sequences" for name, number in learned.items()
     )
     return [f"{_best(found)} These are training data: {same}." if learned else _best(found)]
 

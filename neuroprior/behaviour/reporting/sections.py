@@ -123,7 +123,9 @@ def score_section(found: Evaluation) -> Part | None:
     never = never_taken(found.plans) if any(model.name == "uniform" for model in found.models) else ""
     caption += f" {never[:1].upper()}{never[1:]}." if never else ""
     if learned:
-        same = "; ".join(f"{number:,} of {len(found.plans):,} sequences for {name}" for name, number in learned.items())
+        same = "; ".join(
+            f"{number:,} of {len(found.scored):,} sequences for {name}" for name, number in learned.items()
+        )
         caption += f" Training data: sequences that the prior has learned from, at least in part ({same})."
     held_out = "" if saved else " for behaviours that it has not learned from"
     text = [
@@ -146,16 +148,14 @@ def score_section(found: Evaluation) -> Part | None:
 
 
 def _not_trained(found: Evaluation) -> list[str]:
-    """A sentence on the networks that promised too little to be trained."""
-    promises, scored = found.settings.get("promises", {}), {model.label for model in found.models}
-    names = [name for name in promises if name not in scored]
-    if not names:
+    """Sentences on the networks that promised too little to be trained."""
+    promises = found.settings.get("promises", {})
+    if not promises:
         return []
-    names += [name for name in ("transformer",) if name in found.settings["models"] and name not in scored]
-    most = max(promises[name] for name in names if name in promises)
+    names = listed([f"{name.replace(',', '')} ({max(bits, 0):.4f})" for name, bits in promises.items()])
     return [
-        f"Not trained: {listed(names)}. A tenth of the training, in the first fold, promised a gain of at most"
-        f" {most:.4f} bits per behaviour, too little to be kept. `--models` trains networks in any case."
+        "Networks are trained where a tenth of their training, in the first fold, promises enough to be kept. Not"
+        f" trained, with the bits per behaviour that they promised at most: {names}. `--effort full` trains all."
     ]
 
 
@@ -178,7 +178,8 @@ def lag_section(found: Evaluation) -> Part | None:
         frame = frames["how_far_back"] = result.frame()
         for row in frame.assign(starred=frame["adds"]).to_dict("records"):
             findings.append(gain_finding("lags", f"lag {row['lag']}", f"The behaviour {row['lag']} back", row))
-        if reach := int(frame["adds"].sum()):  # the last lag that adds is said with the verdict, before the others
+        reach = 0 if result.few else result.reach
+        if reach:  # the last lag that adds is said with the verdict, before the others
             last = findings.pop(reach - 1)
             findings.insert(0, replace(last, sentence=f"{result.verdict} {last.sentence}"))
         verdicts = [] if result.few or reach else [result.verdict]
@@ -190,7 +191,7 @@ def lag_section(found: Evaluation) -> Part | None:
             "p": lambda row: p_text(row.corrected) + "*" * row.adds,
         }
         caption = f"Bits that the behaviour k steps back adds, over {result.unit}."
-        caption += "" if result.few else " p: of a gain at this lag and all before it. *: p < 0.05."
+        caption += "" if result.few else " p: corrected for the lags. *: p < 0.05."
         tables.append(table(frame, _without_p(columns, result.few), caption, "How far back"))
     if len(found.gains):
         lags = found.gains.assign(curve=figures.lag_names(found.gains), cell=found.gains["bits"].map("{:.4f}".format))

@@ -101,11 +101,12 @@ def fitted_experts(
         effort: which networks there are.
         generator: draws their initial weights and the order of training.
         settings: of their training. Networks share the `seconds` that are left when all has been counted, if these are
-            limited; those for which nothing is left are not trained.
-        names: of the networks that are trained; None: those that promise to bring something, see `screen`, and with
-            the full effort all.
+            limited; those for which nothing is left are not trained. A quarter of the share of each is for screening.
+        names: of the networks that are trained; None: those that promise to bring something beyond the experts that
+            count, see `screen`, and with the full effort all.
     """
-    begun, seconds = monotonic(), settings.get("seconds")
+    seconds = settings.get("seconds")
+    until = inf if seconds is None else monotonic() + seconds
     tell = partial(print, file=sys.stderr, flush=True) if settings.get("progress", True) else lambda line: None
     with saying("counting chains and trees") if settings.get("progress", True) else nullcontext():
         fitted = [*counted(learned, held_out, contexts)]
@@ -114,24 +115,25 @@ def fitted_experts(
     made = networks(learned.num_actions, contexts, effort, draw_seed(generator) % 2**31)
     made = {name: prior for name, prior in made.items() if names is None or name in names}
     forecasts = stack_forecasts(fitted, held_out) if names is None else torch.empty(0)
-    for number, (name, prior) in enumerate(made.items()):
-        if seconds is not None:
-            left = (seconds - (monotonic() - begun)) / (len(made) - number)
-            if left <= 0:
-                break
-            settings = {**settings, "seconds": left}
-        if names is None:
-            promise = screen(prior, forecasts, learned, held_out, settings)
-            if not promise.pays:
+    for others, (name, prior) in zip(range(len(made), 0, -1), made.items(), strict=True):
+        how = {"validation": held_out, **settings}
+        if names is None and until > monotonic():
+            promise = screen(prior, forecasts, learned, held_out, _within(how, until, 8 * others))
+            if promise is not None and not promise.pays:
                 left_out[name] = promise
                 tell(f"{name}: not trained, as it promises {promise.gain:.4f} of {promise.needed:.4f} nats per action")
                 continue
-        prior.fit(plans_for(prior, learned), generator=generator, **{"validation": held_out, **settings})
-        if names is None:
-            forecasts = torch.cat([forecasts, stack_forecasts([prior], held_out)], 2)
+        if until <= monotonic():
+            break
+        prior.fit(plans_for(prior, learned), generator=generator, **_within(how, until, others))
         fitted.append(prior)
         trained.append(name)
     return Experts(fitted, tuple(trained), left_out)
+
+
+def _within(settings: dict[str, Any], until: float, parts: int) -> dict[str, Any]:
+    """The settings of a training that takes one of so many parts of the seconds that are left, if these are limited."""
+    return settings if until == inf else {**settings, "seconds": max(until - monotonic(), 0.0) / parts}
 
 
 def number_tried(experts: Iterable[Prior]) -> int:

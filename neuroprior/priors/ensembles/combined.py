@@ -7,6 +7,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
+from neuroprior._checks import check_choices
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.construction import as_prior, described
@@ -90,8 +91,9 @@ class CombinedPrior(MixturePrior):
         share: of the fixed share; set by `fit`.
         effort: which networks there are where no experts are given: "fast", a GRU; "standard", a stacked prior as well;
             "full", a transformer as well, and all are trained.
-        networks: names of those that `fit` trains; None: those that promise to bring something after a tenth of their
-            training (`neuroprior.priors.ensembles.screening.screen`). `fit` keeps the names of them in `trained`.
+        networks: where no experts are given, the names of those that `fit` trains; None: those that promise to bring
+            something after a tenth of their training (`neuroprior.priors.ensembles.screening.screen`). `fit` keeps
+            their names in `trained`.
         num_contexts, context_size: see `Prior`.
 
     Raises:
@@ -124,8 +126,8 @@ class CombinedPrior(MixturePrior):
         networks: Sequence[str] | None = None,
     ) -> None:
         check_effort(effort)
-        if networks is not None and (isinstance(networks, str) or set(networks) - set(OF_EFFORT[effort])):
-            raise ValueError(f"`networks` must be some of {', '.join(OF_EFFORT[effort])}, got {networks!r}")
+        if networks is not None:
+            check_choices("networks", networks, OF_EFFORT[effort], 0)
         made = [UniformPrior(num_actions)] if experts is None else experts
         super().__init__(num_actions, made, share, num_contexts, context_size)
         self.effort: Effort = effort

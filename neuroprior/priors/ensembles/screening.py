@@ -13,21 +13,23 @@ from neuroprior.priors.ensembles.pooling import NETWORK_GAIN_NATS, HeldOut, stac
 from neuroprior.priors.learning import plans_for
 from neuroprior.priors.prior import Prior
 
-PARTS = 20
-"""A network is judged after one such part of the steps of its training, and after two."""
+PARTS, MIN_PART = 20, 50
+"""A network is judged after one such part of the steps of its training, of at least so many steps, and after two."""
 
 
 class Screening(NamedTuple):
     """What a network promises beyond other experts, in nats per held-out action.
 
     Attributes:
-        early, late: its gains after a twentieth and a tenth of the steps.
+        early, late: its gains after one and after two parts of its training.
         needed: what it has to bring once it is trained, to be kept.
+        doublings: how often the steps of two parts can be doubled until it is trained.
     """
 
     early: float
     late: float
     needed: float
+    doublings: float = log2(PARTS / 2)
 
     @property
     def gain(self) -> float:
@@ -36,7 +38,7 @@ class Screening(NamedTuple):
         The gain is taken to grow with each doubling of the steps as it did with the last. Learning curves flatten, so
         that this is seldom too little.
         """
-        return self.late + max(self.late - self.early, 0.0) * log2(PARTS / 2)
+        return self.late + max(self.late - self.early, 0.0) * self.doublings
 
     @property
     def pays(self) -> bool:
@@ -51,8 +53,8 @@ def screen(
     held_out: Plans,
     settings: Mapping[str, Any],
     seed: int = 0,
-) -> Screening:
-    """Return what a network promises, from its gains in two short trainings.
+) -> Screening | None:
+    """Return what a network promises, from its gains in two short trainings; None where its training is as short.
 
     A gain is how much likelier held-out plans are when the network joins the mixture and the pool of other experts.
 
@@ -68,7 +70,10 @@ def screen(
 
     plans, mask = plans_for(network, learned), held_out.mask()
     steps = planned_steps(plans, Settings(**{"validation": held_out, **settings}))
-    how = {"validation": held_out, **settings, "max_steps": max(steps // PARTS, 1)}
+    part = max(steps // PARTS, MIN_PART)
+    if steps < 4 * part:
+        return None
+    how = {"validation": held_out, **settings, "max_steps": part}
     losses, trial = [], deepcopy(network)
     generator = torch.Generator().manual_seed(seed)
     for _ in range(2):  # the second training goes on from the weights of the first
@@ -77,4 +82,4 @@ def screen(
         losses.append(HeldOut(joined, held_out.actions, mask, joined.shape[2] + 2).combined()[1])
     without = HeldOut(forecasts, held_out.actions, mask, joined.shape[2] + 2)
     early, late = (without.combined()[1] - loss for loss in losses)
-    return Screening(early, late, without.tolerance(NETWORK_GAIN_NATS))
+    return Screening(early, late, without.tolerance(NETWORK_GAIN_NATS), log2(steps / (2 * part)))

@@ -10,7 +10,7 @@ from scipy import stats
 
 from neuroprior import Plans
 from neuroprior.behaviour import Difference, HowFarBack, how_far_back, ratio_difference
-from neuroprior.behaviour.analysis.lags import pieces
+from neuroprior.behaviour.analysis.lags import FIRST_SHARE, _fallback, pieces
 from neuroprior.plans.folds import BLOCKS
 from tests.support.sources import FALSE_ALARM, refuses, seeded
 
@@ -87,19 +87,51 @@ def test_gains_by_hand():
     assert not result.frame()["adds"].any()
 
 
-def test_lags_are_tested_in_their_order():
-    """A lag after one without a gain does not count, however clear; nor does a loss."""
+def test_the_verdict_names_the_last_lag_that_adds():
+    """Also where nearer ones add nothing alone; a loss never counts."""
     gains = [Difference(0.3, 0.2, 0.4, 1e-5), Difference(-0.3, -0.4, -0.2, 1e-5), Difference(0.3, 0.2, 0.4, 1e-9)]
     some = HowFarBack(gains, np.array([1e-5, 1.0, 1.0]), 1, "groups", 9, "")
     assert some.frame()["adds"].tolist() == [True, False, False]
     assert some.verdict == "How far back: one behaviour; a second adds nothing (-.3 bits, -.4 to -.2)."
-    every = HowFarBack(gains[::2], np.array([1e-5, 1e-5]), 2, "groups", 9, "")
-    assert every.verdict == "How far back: two behaviours at least."
-    in_turn = how_far_back(Plans(torch.tensor([[0, 0], [0, 1], [1, 0], [1, 1]] * 10).repeat(1, 30), 2), 2)
-    assert in_turn.gains[1].mean > 0.9
-    assert (in_turn.reach, in_turn.corrected[1]) == (0, in_turn.corrected[0])
+    every = HowFarBack(gains, np.array([1e-5, 1.0, 1e-5]), 3, "groups", 9, "")
+    assert every.verdict == "How far back: three behaviours at least."
+    assert every.frame()["adds"].tolist() == [True, False, True]
     none = HowFarBack(gains[1:], np.array([1.0, 1.0]), 0, "groups", 9, "")
     assert none.verdict == "How far back: no behaviour; the last adds nothing (-.3 bits, -.4 to -.2)."
+
+
+def test_a_lag_is_found_that_nearer_ones_hide():
+    """Each action is the one two before it: the last one alone says nothing."""
+    in_turn = how_far_back(Plans(torch.tensor([[0, 0], [0, 1], [1, 0], [1, 1]] * 10).repeat(1, 30), 2), 3)
+    assert in_turn.gains[1].mean > 0.9
+    assert in_turn.frame()["adds"].tolist() == [False, True, False]
+    assert in_turn.verdict.startswith("How far back: two behaviours; a third adds nothing")
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_p_values_are_corrected_by_the_fallback_procedure(seed):
+    """The least level at which each passes, against a search over all levels; and by hand for two lags."""
+    p_values = 10 ** -torch.empty(5).uniform_(0, 4, generator=seeded(seed)).double().numpy()
+    shares = np.array([FIRST_SHARE, *[(1 - FIRST_SHARE) / 4] * 4])
+    due = np.ones(5)
+    for level in np.logspace(0, -6, 20_000):
+        spent = 0.0
+        for lag in range(5):
+            spent += level * shares[lag]
+            if p_values[lag] > spent:
+                spent = 0.0
+            else:
+                due[lag] = level
+    assert _fallback(p_values) == pytest.approx(due, rel=1e-3)
+    assert _fallback(np.array([0.04, 0.001])) == pytest.approx([0.05, 0.005])
+    assert _fallback(np.array([0.008, 0.03])) == pytest.approx([0.01, 0.03])
+    assert _fallback(np.array([0.03])) == pytest.approx([0.03])
+
+
+def test_of_lags_without_a_gain_seldom_one_is_found():
+    """At most 5 % of 2,000 studies with uniform p-values, with a false-alarm probability of 1e-6."""
+    p_values = torch.rand(2000, 4, generator=seeded(1)).double().numpy()
+    assert sum(_fallback(row).min() < 0.05 for row in p_values) <= stats.binom.isf(1e-6, 2000, 0.05)
 
 
 def test_an_action_that_is_known_from_the_last_one():

@@ -108,9 +108,9 @@ def test_a_single_plan_is_cut_for_scores_and_described_whole():
     [
         ({"models": ["counts"]}, ["lags"], "counts, lags"),
         ({"models": ["gru"]}, ["lags"], "gru, lags, gru-lags"),
-        ({}, ["scores"], "counts, gru, transformer, stacked, combined"),
-        ({"effort": "full"}, ["scores"], "counts, gru, transformer, stacked, combined"),
-        ({"effort": "fast"}, ["scores"], "counts, gru, combined"),
+        ({}, ["scores"], "counts, combined, gru, stacked"),
+        ({"effort": "full"}, ["scores"], "counts, combined, gru, transformer, stacked"),
+        ({"effort": "fast"}, ["scores"], "counts, combined, gru"),
         ({"effort": "fast", "models": ["stacked", "combined"]}, ["scores"], "stacked, combined"),
     ],
 )
@@ -211,6 +211,44 @@ def test_networks_are_trained_where_they_pay_or_are_named(pays, named, monkeypat
     made = report(chain(20), sections=["scores"], fits=FitOptions(models=models, folds=3, max_steps=1, processes=1))
     found, text = set(made.frames["plans"]["model"]), " ".join(made.sections[0].text)
     assert ("gru" in found) == (pays or named)
-    assert ("transformer" in found) == pays
-    assert ("Not trained: gru, stacked, transformer." in text) == (not pays and not named)
+    assert ("promised at most: gru (0.0000), stacked (0.0000)." in text) == (not pays and not named)
     assert len(asked) == (0 if named else 2)
+
+
+def test_test_plans_that_are_learned_from_are_marked():
+    """But for short ones, which may be equal by chance."""
+    learned, other = (Plans(torch.randint(3, (size, 30), generator=seeded(size)), 3) for size in (9, 6))
+    parts = Plans(torch.cat([learned.actions[:3], other.actions])[:, :25], 3)
+    assert "training data" not in report(learned, test=parts, **SCORES).settings
+    again = Plans(torch.cat([learned.actions[:4], other.actions]), 3)
+    assert report(learned, test=again, **SCORES).settings["training data"] == {"each model": 4}
+    short = learned.actions[:, :9]
+    assert "training data" not in report(Plans(short, 3), test=Plans(short[:4].clone(), 3), **SCORES).settings
+
+
+def test_an_error_leaves_a_page_that_says_so(tmp_path, monkeypatch):
+    def fail(*args: Any) -> None:
+        raise ValueError("no more")
+
+    monkeypatch.setattr(plan_report, "evaluate", fail_after(1, plan_report.evaluate, fail))
+    with pytest.raises(ValueError, match="no more"):
+        report(chain(), out=tmp_path, fits=QUICK_IN_TWO, sections=["file", "scores"])
+    assert "Stopped by an error (no more): models or modes are missing." in (tmp_path / "report.html").read_text()
+
+
+def fail_after(number: int, function: Any, fail: Any) -> Any:
+    """The function, which fails from the call after so many on."""
+    calls = []
+
+    def called(*args: Any) -> Any:
+        calls.append(args)
+        return function(*args) if len(calls) <= number else fail()
+
+    return called
+
+
+def test_too_few_actions_are_refused_at_once(tmp_path):
+    plans = Plans(torch.tensor([[0, 1], [1, 0]]), 2, torch.tensor([2, 1]), group=torch.tensor([0, 1]))
+    with pytest.raises(ValueError, match="at least 4 actions to learn from are needed in each fold, got 1"):
+        report(plans, out=tmp_path, sections=["scores"], fits=FitOptions(models=["counts"], processes=1))
+    assert not (tmp_path / "report.html").exists()
