@@ -6,14 +6,14 @@ import torch
 
 from neuroprior.behaviour.durations.past_durations import PastDurations
 from neuroprior.plans import Plans
-from neuroprior.plans.folds import fair_split, longest_cut, num_units, ungrouped
+from neuroprior.plans.folds import FOLDS, fair_split, longest_cut, num_units, ungrouped
 from neuroprior.priors.construction import context_arguments
 
 MIN_PARTS, MIN_ACTIONS = 3, 2
 """Parts that plans are split into, and the fewest actions of each."""
 
-FEW_GROUPS, FOLDS = 50, 5
-"""Groups below which the comparison is a cross-validation, as a tenth of them would be few; and its folds."""
+FEW_GROUPS = 50
+"""Groups below which the comparison is a cross-validation, as a tenth of them would be few."""
 
 MIN_ACTIONS_OF_TWO = 100
 """Two plans or groups are enough if each has so many actions; validation then takes some of the plans, or the end of

@@ -13,6 +13,9 @@ from neuroprior.plans.sequences import Sequences
 FEWEST_UNITS = 2
 """Independent units that an interval needs; where there are fewer groups (or plans), a finer unit is taken."""
 
+FOLDS = 5
+"""Parts that are held out in turn, where their number is not given; fewer where there are fewer units."""
+
 BLOCKS = 40
 """Parts into which a single plan is cut, so that there are units for intervals and folds."""
 

@@ -13,7 +13,7 @@ from torch.nn import functional
 from neuroprior._checks import check_memory, is_number
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
-from neuroprior.plans.folds import folds, num_units
+from neuroprior.plans.folds import FOLDS, folds, num_units
 from neuroprior.priors.construction import as_prior, described
 from neuroprior.priors.learning import (
     counted_plans,
@@ -25,9 +25,6 @@ from neuroprior.priors.learning import (
 )
 from neuroprior.priors.prior import Prior
 from neuroprior.sampling.states import State
-
-FOLDS = 5
-"""Parts of the training groups; each is predicted by a base that has counted in the others."""
 
 START_CONCENTRATIONS = (1.0, 10.0, 100.0)
 """From these the likeliest concentrations are searched."""

@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from neuroprior._statistics import Difference, ratio_difference
 from neuroprior.behaviour.recorded_plans import RecordedPlans, action_names, group_names
 from neuroprior.behaviour.recordings import Recordings
-from neuroprior.plans.folds import folds
+from neuroprior.plans.folds import FOLDS, folds
 from neuroprior.priors.adaptive import AdaptivePrior
 from neuroprior.priors.counts import MarkovPrior
-
-FOLDS = 5
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from neuroprior._checks import as_list, check_sizes
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.behaviour.analysis.comparison import Score, action_bits, score_bits
 from neuroprior.plans import Plans, constant_context
-from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, num_units
+from neuroprior.plans.folds import FEWEST_UNITS, FOLDS, divisible, folds, num_units
 from neuroprior.plans.plans import AnyPlans, check_are_plans
 from neuroprior.priors import SwitchingPrior
 from neuroprior.priors.construction import context_arguments
@@ -30,9 +30,6 @@ STABLE = 0.7
 
 MIN_ENDS = 1e-6
 """Expected ends of a mode below which none is expected."""
-
-FOLDS = 5
-"""The most folds on which the number of modes is chosen."""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from neuroprior.behaviour.durations.laws import (
 )
 from neuroprior.behaviour.recorded_plans import RecordedPlans, durations_of
 from neuroprior.plans import Plans
-from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, num_units
+from neuroprior.plans.folds import FEWEST_UNITS, FOLDS, divisible, folds, num_units
 from neuroprior.priors.prior import as_actions
 from neuroprior.priors.saved import SavedModule
 
@@ -42,9 +42,6 @@ exponential durations, the exponential law was chosen for 45 without this, and f
 
 AT_ONCE = 2**18
 """Durations, each as often as there are parts without it, that laws are fitted to together: of more, part by part."""
-
-FOLDS = 5
-"""Parts of the plans, of which each is held out once."""
 
 
 class DurationLaw(NamedTuple):

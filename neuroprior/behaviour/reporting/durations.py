@@ -24,9 +24,7 @@ from neuroprior.behaviour.reporting.part import LISTED, Part, p_text, without_ve
 from neuroprior.behaviour.reporting.scores import Evaluation
 from neuroprior.behaviour.reporting.survival import survival_figure, survival_findings, survival_table
 from neuroprior.plans import BLOCKS, FEWEST_UNITS, divisible, folds, in_parts
-from neuroprior.plans.folds import num_units
-
-FOLDS = 5
+from neuroprior.plans.folds import FOLDS, num_units
 
 CLASSES = 3
 """Classes of the last duration: short, medium and long for its action."""

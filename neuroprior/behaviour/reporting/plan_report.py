@@ -45,7 +45,7 @@ from neuroprior.behaviour.reporting.scores import Evaluation, cross_validation, 
 from neuroprior.behaviour.reporting.sections import OF_MODELS, SECTIONS, describe
 from neuroprior.plans import Plans
 from neuroprior.plans.columns import listed
-from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
+from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, FOLDS, in_parts
 from neuroprior.plans.plans import AnyPlans
 from neuroprior.priors import Prior, load
 from neuroprior.priors.matching import learned_names, renumbered
@@ -62,9 +62,6 @@ SECONDS_A_STATUS = 60
 
 LONG_ENOUGH = 20
 """Actions from which on equal plans are thought to be the same one."""
-
-FOLDS = 5
-"""Folds where their number is not given; fewer where there are fewer groups."""
 
 
 def report(

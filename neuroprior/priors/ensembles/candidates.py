@@ -13,7 +13,7 @@ import torch
 
 from neuroprior._jobs import saying
 from neuroprior._random import draw_seed
-from neuroprior.plans.folds import divisible, folds, in_parts, num_units, pieces, ungrouped
+from neuroprior.plans.folds import FOLDS, divisible, folds, in_parts, num_units, pieces, ungrouped
 from neuroprior.plans.plans import Plans
 from neuroprior.priors.adaptive import AdaptivePrior
 from neuroprior.priors.construction import construct
@@ -42,8 +42,8 @@ OF_EFFORT: dict[Effort, tuple[str, ...]] = {
 ORDERS = range(7)
 """Orders of the Markov chains that are tried: the best is an expert, and all are baselines in comparisons."""
 
-FOLDS, ENOUGH, MOST = 5, 1000, 20_000
-"""Where fewer than `ENOUGH` actions are held out, what counts is chosen on the others as well, in so many parts, if
+ENOUGH, MOST = 1000, 20_000
+"""Where fewer than `ENOUGH` actions are held out, what counts is chosen on the others as well, in `FOLDS` parts, if
 these are at most `MOST`.
 """
 
