@@ -9,9 +9,20 @@ import pytest
 from hypothesis import settings
 from matplotlib.figure import Figure
 
+from tests.support.slow import slow_cases
+
 # So that a test finds an error always or never.
 settings.register_profile("same", derandomize=True, database=None)
 settings.load_profile("same")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests that take long go to the slow lane."""
+    long = slow_cases()
+    for item in items:
+        if item.nodeid in long:
+            item.add_marker(pytest.mark.slow)
 
 
 def pytest_collection_finish() -> None:

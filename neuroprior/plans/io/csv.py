@@ -4,6 +4,7 @@ import csv
 import math
 import re
 from bisect import bisect_right
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -138,7 +139,7 @@ class _Sheet:
         self.width = len(first)
         names = [cell.strip().lower() for cell in first]
         self.columns = {name: i for i, name in enumerate(names)} if "action_1" in names else {}
-        repeated = [name for name in names if OUR_COLUMN.fullmatch(name) and names.count(name) > 1]
+        repeated = [name for name, number in Counter(names).items() if number > 1 and OUR_COLUMN.fullmatch(name)]
         if self.columns and repeated:
             raise ValueError(f"{path}, line 1: the column {repeated[0]!r} is there twice; rename or remove one")
         word = next((name for name in names if OTHER_WORDS.fullmatch(name)), None)

@@ -13,7 +13,7 @@ from neuroprior.priors.ensembles.screening import Screening, screen
 from tests.support.chains import markov_plans, markov_probs
 from tests.support.sources import seeded
 
-SILENT = {"progress": False, "max_steps": 200}
+SILENT = {"progress": False, "max_steps": 400}
 
 
 def repeating(number: int, seed: int) -> Plans:
@@ -34,11 +34,11 @@ def test_gains_are_extrapolated_by_doublings(early, late, gain):
 
 
 def test_a_network_promises_what_counts_cannot_see():
-    learned, held_out = repeating(300, 0), repeating(80, 3)
+    learned, held_out = repeating(200, 0), repeating(60, 3)
     forecasts = stack_forecasts(list(counted(learned, held_out, {})), held_out)
     network = GRUPrior(3)
     before = {name: values.clone() for name, values in network.state_dict().items()}
-    promise = screen(network, forecasts, learned, held_out, SILENT | {"max_steps": 1000})
+    promise = screen(network, forecasts, learned, held_out, SILENT)
     assert promise.pays
     assert promise.late > 0.01
     assert not network.sized
@@ -46,11 +46,8 @@ def test_a_network_promises_what_counts_cannot_see():
 
 
 def test_a_network_that_pays_learns_as_without_screening():
-    learned, held_out = repeating(300, 0), repeating(80, 3)
-    made = [
-        fitted_experts(learned, held_out, {}, "fast", seeded(5), SILENT | {"max_steps": 1000}, names)
-        for names in (None, ["gru"])
-    ]
+    learned, held_out = repeating(200, 0), repeating(60, 3)
+    made = [fitted_experts(learned, held_out, {}, "fast", seeded(5), SILENT, names) for names in (None, ["gru"])]
     first, second = (one.fitted[-1] for one in made)
     assert type(first) is GRUPrior
     assert not made[0].left_out
@@ -60,7 +57,7 @@ def test_a_network_that_pays_learns_as_without_screening():
 def test_no_network_is_trained_on_a_chain():
     probs = markov_probs(3, 1, seed=1)
     learned, held_out = (markov_plans(probs, number, 30, seed=number) for number in (300, 70))
-    made = fitted_experts(learned, held_out, {}, "standard", seeded(0), SILENT | {"max_steps": 1000})
+    made = fitted_experts(learned, held_out, {}, "standard", seeded(0), SILENT)
     assert not any(isinstance(e, GRUPrior) for e in made.fitted)
     assert (made.trained, list(made.left_out)) == ((), ["gru", "stacked"])
     assert all(promise.gain < promise.needed for promise in made.left_out.values())
