@@ -53,7 +53,7 @@ nb_output_stderr = "remove"  # progress
 
 nitpicky = True
 # names of other libraries, which only their own sites could resolve
-OTHERS = "torch|Tensor|numpy|np|pandas|matplotlib|lightning|rich|collections|contextlib|pathlib|abc|os"
+OTHERS = "torch|Tensor|numpy|np|pandas|matplotlib|networkx|lightning|rich|collections|contextlib|pathlib|abc|os"
 nitpick_ignore_regex = [
     ("py:.*", rf"({OTHERS})(\..*)?"),
     ("py:.*", r"(typing\.Literal\[|neuroprior\.[\w.]+ \| ).*"),  # parts of the types of grouped attributes

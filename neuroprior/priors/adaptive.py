@@ -42,7 +42,7 @@ PAIRS_AT_ONCE = 2**24
 class AdaptivePrior(Prior):
     """A base prior whose predictions are drawn towards what was done before in the same sequence.
 
-    At level k it counts which actions followed the last k actions. With p_-1, the prediction of the base,
+    At level k it counts which actions followed the last k actions. With the prediction of the base as level -1,
 
         p_k(a) = (n_k(a) + c_k p_{k-1}(a)) / (n_k + c_k),
 
