@@ -149,6 +149,10 @@ def learned_from(folder: Path, plans: Plans) -> list[bool]:
     known = content.get("plans") if isinstance(content, dict) else None
     if not isinstance(known, list) or not all(isinstance(one, str) for one in known):
         raise ValueError(f"{place}: damaged; it does not say which plans were learned from")
-    known = set(known)
-    digests, taken = plan_digests(plans), plans.mask().any(1).tolist()
-    return [any_taken and digest in known for digest, any_taken in zip(digests, taken, strict=True)]
+    return are_among(plans, set(known))
+
+
+def are_among(plans: Plans, known: set[str], least: int = 1) -> list[bool]:
+    """Which plans, of at least so many actions, are among those with these digests."""
+    long = (plans.mask().sum(1) >= least).tolist()
+    return [counts and digest in known for digest, counts in zip(plan_digests(plans), long, strict=True)]

@@ -170,15 +170,14 @@ def _fitted(
         training, validation = split_validation(learned, None, generator)
         networks = OF_EFFORT[design.effort] if job.networks is None and not design.screened else job.networks
         how = (design.effort, generator, design.training, networks)
-        experts, trained, left_out = fitted_experts(training, validation, sizes, *how)
-        combined = construct(partial(CombinedPrior, experts=experts), learned.num_actions, sizes)
+        experts = fitted_experts(training, validation, sizes, *how)
+        combined = construct(partial(CombinedPrior, experts=experts.fitted), learned.num_actions, sizes)
         assert isinstance(combined, CombinedPrior)
-        combined.learn_weights(validation, number_tried(experts), training)
-        counted = [expert.recount(learned) for expert in experts]
-        yield from (
-            (name, "", expert) for name, expert in zip(trained, counted[len(counted) - len(trained) :], strict=True)
-        )
-        yield from ((name, "", promise) for name, promise in left_out.items())
+        combined.learn_weights(validation, number_tried(experts.fitted), training)
+        for expert in experts.fitted:
+            expert.recount(learned)
+        for name, model in (experts.networks | experts.left_out).items():
+            yield name, "", model
         yield COMBINED, combined.summary(), combined
     else:
         prior: Any = construct(NETWORKS[kind], learned.num_actions, sizes | {"seed": seed})

@@ -49,7 +49,7 @@ from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, FOLDS, in_parts
 from neuroprior.plans.plans import AnyPlans
 from neuroprior.priors import Prior, load
 from neuroprior.priors.matching import learned_names, renumbered
-from neuroprior.priors.scoring import learned_from, plan_digests
+from neuroprior.priors.scoring import are_among, learned_from, plan_digests
 
 MOST_ACTIONS = 10_000
 """Kinds of actions beyond which they are thought to be names that look like numbers."""
@@ -231,7 +231,8 @@ def _cross_validate(
             f"{_name(plans)}: at least {2 * FEWEST_UNITS} actions to learn from are needed in each fold, got {fewest}"
         )
     settings: dict[str, Any] = {"models": ", ".join(kinds)}
-    again = 0 if other is None else _learned_again(whole, other)
+    # Short plans may be equal by chance.
+    again = 0 if other is None else sum(are_among(other, set(plan_digests(whole)), LONG_ENOUGH))
     todo = jobs(design, kinds, inputs)
     counts, networks = ([job for job in todo if (job.kind in COUNTS) == first] for first in (True, False))
 
@@ -265,22 +266,16 @@ def _cross_validate(
             first = [job for job in networks if not screened or (job.kind == COMBINED and job.fold == 0)]
             yield from fitting(first)
             trained = {job.inputs: trained_networks(run.read(job)) for job in first}
-            rest = [
+            others = [
                 replace(job, networks=trained[job.inputs] if job.kind == COMBINED else None)
                 for job in networks
                 if job not in first and (job.kind == COMBINED or trained[job.inputs])
             ]
-            yield from fitting(rest)
-            found = evaluated([*counts, *first, *rest])
+            yield from fitting(others)
+            found = evaluated([*counts, *first, *others])
             yield _Stage(found, (*OF_MODELS, *["durations"] * (DURATIONS in inputs)), _still(*later[1:]))
         if modes:
             yield _Stage(found, ("modes",), "")
-
-
-def _learned_again(learned: Plans, test: Plans) -> int:
-    """How many test plans are among those that are learned from, but for short ones, which may be equal by chance."""
-    known, long = set(plan_digests(learned)), (test.mask().sum(1) >= LONG_ENOUGH).tolist()
-    return sum(digest in known for digest, counts in zip(plan_digests(test), long, strict=True) if counts)
 
 
 def _still(*later: str) -> str:

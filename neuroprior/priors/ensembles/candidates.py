@@ -4,7 +4,6 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from copy import deepcopy
-from functools import partial
 from math import inf
 from time import monotonic
 from typing import Any, Literal, NamedTuple
@@ -73,14 +72,19 @@ class Experts(NamedTuple):
     """Experts that are fitted.
 
     Attributes:
-        fitted: the experts that count, and behind them the networks.
-        trained: the names of the networks.
+        counting: those that count.
+        networks: those that are trained, by name.
         left_out: by name, what networks promised that were not trained for it.
     """
 
-    fitted: list[Prior]
-    trained: tuple[str, ...]
+    counting: list[Prior]
+    networks: dict[str, Prior]
     left_out: dict[str, Screening]
+
+    @property
+    def fitted(self) -> list[Prior]:
+        """All of them, networks last."""
+        return [*self.counting, *self.networks.values()]
 
 
 def fitted_experts(
@@ -107,28 +111,28 @@ def fitted_experts(
     """
     seconds = settings.get("seconds")
     until = inf if seconds is None else monotonic() + seconds
-    tell = partial(print, file=sys.stderr, flush=True) if settings.get("progress", True) else lambda line: None
-    with saying("counting chains and trees") if settings.get("progress", True) else nullcontext():
-        fitted = [*counted(learned, held_out, contexts)]
-    trained, left_out = list[str](), dict[str, Screening]()
+    shown = settings.get("progress", True)
+    with saying("counting chains and trees") if shown else nullcontext():
+        experts = Experts([*counted(learned, held_out, contexts)], {}, {})
     names = OF_EFFORT[effort] if names is None and effort == "full" else names
-    made = networks(learned.num_actions, contexts, effort, draw_seed(generator) % 2**31)
-    made = {name: prior for name, prior in made.items() if names is None or name in names}
-    forecasts = stack_forecasts(fitted, held_out) if names is None else torch.empty(0)
-    for others, (name, prior) in zip(range(len(made), 0, -1), made.items(), strict=True):
+    untrained = networks(learned.num_actions, contexts, effort, draw_seed(generator) % 2**31)
+    untrained = {name: prior for name, prior in untrained.items() if names is None or name in names}
+    forecasts = stack_forecasts(experts.counting, held_out) if names is None else torch.empty(0)
+    for others, (name, prior) in zip(range(len(untrained), 0, -1), untrained.items(), strict=True):
         how = {"validation": held_out, **settings}
         if names is None and until > monotonic():
             promise = screen(prior, forecasts, learned, held_out, _within(how, until, 8 * others))
             if promise is not None and not promise.pays:
-                left_out[name] = promise
-                tell(f"{name}: not trained, as it promises {promise.gain:.4f} of {promise.needed:.4f} nats per action")
+                experts.left_out[name] = promise
+                if shown:
+                    of_needed = f"{promise.gain:.4f} of {promise.needed:.4f} nats per action"
+                    print(f"{name}: not trained, as it promises {of_needed}", file=sys.stderr, flush=True)
                 continue
         if until <= monotonic():
             break
         prior.fit(plans_for(prior, learned), generator=generator, **_within(how, until, others))
-        fitted.append(prior)
-        trained.append(name)
-    return Experts(fitted, tuple(trained), left_out)
+        experts.networks[name] = prior
+    return experts
 
 
 def _within(settings: dict[str, Any], until: float, parts: int) -> dict[str, Any]:

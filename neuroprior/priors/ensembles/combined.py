@@ -250,9 +250,9 @@ class CombinedPrior(MixturePrior):
         else:
             sizes = {"num_contexts": self.num_contexts, "context_size": self.context_size}
             contexts = {name: size for name, size in sizes.items() if size is not None}
-            made = fitted_experts(learned, held_out, contexts, self.effort, generator, settings, self.networks)
-            self.experts = nn.ModuleList(made.fitted).to(self.device)
-            self.trained = made.trained
+            experts = fitted_experts(learned, held_out, contexts, self.effort, generator, settings, self.networks)
+            self.experts = nn.ModuleList(experts.fitted).to(self.device)
+            self.trained = tuple(experts.networks)
         if self.given:
             self.learn_weights(held_out)
         else:

@@ -52,7 +52,6 @@ def screen(
     learned: Plans,
     held_out: Plans,
     settings: Mapping[str, Any],
-    seed: int = 0,
 ) -> Screening | None:
     """Return what a network promises, from its gains in two short trainings; None where its training is as short.
 
@@ -64,7 +63,6 @@ def screen(
         learned: plans to learn from.
         held_out: N plans of at most L actions.
         settings: of its training.
-        seed: of the trainings.
     """
     from neuroprior.training import Settings, planned_steps  # see `NeuralPrior.fit`
 
@@ -75,11 +73,11 @@ def screen(
         return None
     how = {"validation": held_out, **settings, "max_steps": part}
     losses, trial = [], deepcopy(network)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     for _ in range(2):  # the second training goes on from the weights of the first
         trial.fit(plans, generator=generator, **how)
         joined = torch.cat([forecasts, stack_forecasts([trial], held_out)], 2)
         losses.append(HeldOut(joined, held_out.actions, mask, joined.shape[2] + 2).combined()[1])
     without = HeldOut(forecasts, held_out.actions, mask, joined.shape[2] + 2)
-    early, late = (without.combined()[1] - loss for loss in losses)
-    return Screening(early, late, without.tolerance(NETWORK_GAIN_NATS), log2(steps / (2 * part)))
+    loss = without.combined()[1]
+    return Screening(loss - losses[0], loss - losses[1], without.tolerance(NETWORK_GAIN_NATS), log2(steps / (2 * part)))

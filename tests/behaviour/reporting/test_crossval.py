@@ -166,7 +166,7 @@ def test_the_combined_prior_learns_its_weights_on_plans_that_its_experts_did_not
 
     def experts(learned: Plans, *others: object) -> Experts:
         large = MarkovPrior(3, 6, 0.01, backoff="dirichlet")
-        return Experts([ContextTreePrior(3, 0).fit(learned), large.fit(learned)], (), {})
+        return Experts([ContextTreePrior(3, 0).fit(learned), large.fit(learned)], {}, {})
 
     monkeypatch.setattr(fits, "fitted_experts", experts)
     drawn = torch.multinomial(torch.tensor([0.7, 0.2, 0.1]), 480, True, generator=seeded(0)).view(60, 8)
@@ -293,7 +293,7 @@ def test_the_networks_among_experts_are_counted_again_on_all_that_is_learned(mon
     def experts(learned: Plans, *others: object) -> Experts:
         stacked = StackedPrior(3).fit(learned, max_steps=1, progress=False, generator=seeded(0))
         made.append((stacked, stacked.action_log_probs(test)))
-        return Experts([stacked], ("stacked",), {})
+        return Experts([], {"stacked": stacked}, {})
 
     plans, test = drawn(20, 6), drawn(4, 6, seed=1)
     monkeypatch.setattr(fits, "fitted_experts", experts)
