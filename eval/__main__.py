@@ -32,6 +32,9 @@ COMMANDS = {
     ),
     "modes": Command("eval.modes.command:modes", "hidden modes of mice in a labyrinth, and where they lead"),
     "study": Command("eval.study.command:study", "the tests of conditions in simulated studies: false alarms, power"),
+    "calibration": Command(
+        "eval.study.calibration:calibration", "whether tests hold 5 % and intervals cover 95 %, in many designs"
+    ),
     "pages": Command("eval.pages.command:pages", "all that the pages of results show, in stages"),
     "bench": Command("eval.bench.command:bench", "speed against plain code and other packages"),
 }

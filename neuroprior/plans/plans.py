@@ -189,7 +189,7 @@ class Plans(Sequences):
             action_names=None if self.action_names is None else self.action_names[:-1],
             end=None,
         )
-        return opened.steps(stop=int(lengths.max())) if len(self) else opened
+        return opened.trimmed()
 
     def without_context(self) -> Self:
         """The same plans without their context."""

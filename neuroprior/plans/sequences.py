@@ -114,6 +114,13 @@ class Sequences(ABC):
             cut["lengths"] = (self.lengths - first).clamp(0, max(stop - first, 0))
         return replace(self, **cut)  # type: ignore[type-var]
 
+    def trimmed(self) -> Self:
+        """The same plans without the columns in which none has an action."""
+        if self.lengths is None or not len(self):
+            return self
+        longest = int(self.lengths.max())
+        return self if longest == self.max_length else self.steps(stop=longest)
+
     def split(self, validation: float = 0.1, generator: torch.Generator | None = None) -> tuple[Self, Self]:
         """Split at random into plans for training and plans for validation; groups stay together.
 

@@ -105,8 +105,8 @@ def plans_for(prior: Prior, plans: AnyPlans) -> AnyPlans:
 
 
 def _as_taken(prior: Prior, plans: Plans | Tensor) -> Plans:
-    """As `plans_for`, as `Plans` on the prior's device."""
-    return plans_for(prior, prior.as_plans(plans))
+    """As `plans_for`, as `Plans` on the prior's device, as wide as the longest: padding changes nothing learned."""
+    return plans_for(prior, prior.as_plans(plans)).trimmed()
 
 
 def _warn_of_context(prior: Prior, plans: Plans) -> None:

@@ -2,9 +2,11 @@
 
 from dataclasses import fields, replace
 from functools import partial
+from inspect import isabstract
 
 import pytest
 import torch
+from torch.nn.functional import pad
 
 from neuroprior import behaviour, priors
 from neuroprior.behaviour import SemiMarkovPrior
@@ -19,11 +21,13 @@ from neuroprior.priors import (
     MixturePrior,
     Prior,
     StackedPrior,
+    SwitchingPrior,
     TransformerPrior,
     UniformPrior,
     fit,
 )
 from neuroprior.priors.fitting import PRIORS
+from neuroprior.priors.serialization import load, save
 from neuroprior.training import Settings
 from tests.support.sources import refuses, seeded
 
@@ -51,17 +55,95 @@ NETWORKS = {
     "semi-markov gru": lambda: SemiMarkovPrior(A, GRUPrior(A, 8, context_size=2)),
     "combined": lambda: CombinedPrior(A, [MarkovPrior(A, 1), GRUPrior(A, 8)]),
 }
-ALL = COUNTS | NETWORKS
+SWITCHING = {
+    "switching": lambda: SwitchingPrior(A, 2),
+    "switching context": lambda: SwitchingPrior(A, 3, num_contexts=C),
+}
+ALL = COUNTS | NETWORKS | SWITCHING
 
 
-def plans_for(prior: Prior, num: int = 40) -> Plans:
-    actions = torch.randint(A, (num, 6), generator=seeded(0))
+def plans_for(prior: Prior, num: int = 40) -> RecordedPlans:
+    """Plans of 0 to 7 actions, the last action commonest, in four groups of unlike sizes."""
+    draws = seeded(0)
+    actions = torch.multinomial(torch.tensor([0.2, 0.3, 0.5]), num * 7, replacement=True, generator=draws).view(num, 7)
     context = None
     if prior.num_contexts is not None:
-        context = torch.randint(C, (num, 6), generator=seeded(1))
+        context = torch.randint(C, (num, 7), generator=draws)
     elif prior.context_size is not None:
-        context = torch.randn(num, 6, 2, generator=seeded(1))
-    return RecordedPlans(actions, A, context=context, durations=torch.rand(num, 6, generator=seeded(2)))
+        context = torch.randn(num, 7, 2, generator=draws)
+    return RecordedPlans(
+        actions,
+        A,
+        lengths=torch.randint(8, (num,), generator=draws),
+        context=context,
+        group=torch.tensor([1, 1, 4, 2, 4, 4, 9, 4]).repeat(-(-num // 8))[:num],
+        durations=torch.rand(num, 7, generator=draws) + 0.1,
+    )
+
+
+def fitted(name: str, plans: RecordedPlans | None = None, seed: int = 0) -> Prior:
+    """The prior of this name, after learning from plans."""
+    prior = ALL[name]()
+    quick = QUICK if name in NETWORKS else {}
+    return prior.fit(plans_for(prior) if plans is None else plans, generator=seeded(seed), **quick)
+
+
+def log_probs(prior: Prior, plans: Plans) -> torch.Tensor:
+    """`[N, L]`: of each action of plans, and 0 behind their end."""
+    with torch.no_grad():
+        return prior.action_log_probs(plans).masked_fill(~plans.mask(), 0)
+
+
+def widened(plans: RecordedPlans) -> RecordedPlans:
+    """The same plans with three more columns of padding."""
+    wider = {name: pad(getattr(plans, name), (0, 3)) for name in ("actions", "durations")}
+    if plans.context is not None:
+        one = plans.context.dim() == 3
+        wider["context"] = pad(plans.context, (0, 0, 0, 3) if one else (0, 3))
+    return replace(plans, **wider)
+
+
+def test_no_prior_is_left_out():
+    """A new class stands in the table, or in that of the tests of its wing."""
+    exported = {getattr(room, name) for room in (priors, behaviour) for name in room.__all__}
+    kinds = {kind for kind in exported if isinstance(kind, type) and issubclass(kind, Prior) and not isabstract(kind)}
+    assert kinds == {type(make()) for make in ALL.values()}
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_rows_do_not_depend_on_one_another_nor_on_padding(name):
+    prior = fitted(name)
+    plans = plans_for(prior)
+    found = log_probs(prior, plans)
+    assert bool((found.exp() <= 1 + 1e-6).all())
+    assert found.std() > 0
+    order = torch.randperm(len(plans), generator=seeded(3))
+    torch.testing.assert_close(log_probs(prior, plans[order]), found[order])
+    for row in (0, 7, 39):
+        torch.testing.assert_close(log_probs(prior, plans[row : row + 1])[0], found[row], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(log_probs(prior, widened(plans))[:, :7], found)
+    torch.testing.assert_close(log_probs(prior, replace(plans, group=plans.group * 3 + 5)), found)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_the_same_is_learned_whatever_groups_are_called_and_how_wide_the_padding_is(name):
+    plans = plans_for(ALL[name]())
+    first = log_probs(fitted(name), plans)
+    torch.testing.assert_close(log_probs(fitted(name, plans), plans), first, rtol=0, atol=0)
+    renamed = replace(plans, group=plans.group * 3 + 5)
+    torch.testing.assert_close(log_probs(fitted(name, renamed), plans), first, rtol=0, atol=0)
+    torch.testing.assert_close(log_probs(fitted(name, widened(plans)), plans), first)
+    if name in COUNTS:
+        order = torch.randperm(len(plans), generator=seeded(3))
+        torch.testing.assert_close(log_probs(fitted(name, plans[order]), plans), first, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_saved_prior_predicts_the_same(name, tmp_path):
+    prior = fitted(name)
+    plans = plans_for(prior)
+    again = load(save(prior, tmp_path))
+    torch.testing.assert_close(log_probs(again, plans), log_probs(prior, plans), rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -91,7 +173,7 @@ def test_repr_by_hand():
     )
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", COUNTS | NETWORKS)
 def test_settings_of_fit(name):
     """All take a generator; networks take the settings of training, and priors that count take none."""
     prior = ALL[name]()
@@ -135,12 +217,12 @@ def test_settings_reach_the_networks_inside(name):
 
 @pytest.mark.parametrize("name", ["markov", "gru", "tree"])
 def test_actions_alone_are_plans_without_context(name):
-    prior = ALL[name]()
-    plans = plans_for(prior)
+    prior = fitted(name)
+    actions = plans_for(prior).actions
     for method in (prior.log_prob, prior.action_log_probs):
-        assert torch.equal(method(plans.actions.long()), method(plans))
+        assert torch.equal(method(actions.long()), method(Plans(actions, A)))
     with refuses("context"):
-        MarkovPrior(A, 1, num_contexts=C).log_prob(plans.actions)
+        MarkovPrior(A, 1, num_contexts=C).log_prob(actions)
 
 
 @pytest.mark.parametrize("name", list(PRIORS))
@@ -149,8 +231,6 @@ def test_fit_by_name(name, monkeypatch):
     monkeypatch.setattr("neuroprior.priors.ensembles.candidates.ORDERS", range(3))
     plans = plans_for(COUNTS["markov context"]())
     quick = QUICK if name in ("gru", "transformer", "stacked", "mixture", "combined") else {}
-    if name == "semi-markov":
-        plans = replace(plans, durations=torch.rand(plans.actions.shape, generator=seeded(1)))
     prior = fit(plans, name, generator=seeded(0), **quick)
     assert prior.num_actions == A
     assert prior.num_contexts == (None if name == "uniform" else C)

@@ -420,4 +420,4 @@ class VectorPrior(SavedModule):
             raise
         if plans.action_names is not None:
             self.action_names = tuple(map(str, plans.action_names))
-        return plans[plans.mask().any(1)].to(self.device)
+        return plans[plans.mask().any(1)].trimmed().to(self.device)
