@@ -1,7 +1,7 @@
 """`python -m eval calibration`: do tests hold 5 % and intervals cover 95 %, in studies of many designs?"""
 
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +30,15 @@ from neuroprior.behaviour import (
 )
 from neuroprior.behaviour.reporting.document import Document, publish, table
 from neuroprior.behaviour.reporting.page import Section, Table
-from neuroprior.priors import MarkovPrior, UniformPrior
+from neuroprior.priors import MarkovPrior
 
 BEHAVIOURS = 4
 SESSIONS = 2
 LENGTH = 60
 """Behaviours in the longest sessions."""
+
+BURN_IN = 40
+"""Behaviours before the session begins, so that none drifts."""
 
 SPREAD = 0.25
 """Standard deviation, over subjects, of the logits of transitions and of the logarithms of durations."""
@@ -118,18 +121,20 @@ def draw_study(design: Design, effect: bool, seed: int) -> RecordedPlans:
     treated = random.permutation(number) < -(-number // 3)
     logits[:, 0, 1] += EFFECT * effect * treated
     shape = (number, SESSIONS, LENGTH)
-    actions, drawn, repeated = np.zeros(shape, np.int64), random.random(shape), random.random(shape)
+    actions = np.zeros(shape, np.int64)
+    drawn, repeated = random.random((2, number, SESSIONS, LENGTH + BURN_IN))
     mode = random.random(shape[:2]) < 0.5
     favoured = np.where(np.arange(size) < size // 2, MODE_ODDS, 0.0) * design.modes
     subject = np.arange(number)[:, None]
-    actions[..., 0] = random.integers(size, size=shape[:2])
-    for step in range(1, LENGTH):
-        before, last = actions[..., max(step - 2, 0)], actions[..., step - 1]
+    last = before = random.integers(size, size=shape[:2])
+    for step in range(-BURN_IN, LENGTH):
         mode ^= random.random(shape[:2]) > STAY
         odds = logits[subject, last] + of_two[before, last] + np.where(mode[..., None], favoured, favoured[::-1])
         chances = np.exp(odds).cumsum(-1)
         chosen = (chances < drawn[..., step, None] * chances[..., -1:]).sum(-1)
-        actions[..., step] = np.where(repeated[..., step] < design.repeats, last, chosen)
+        before, last = last, np.where(repeated[..., step] < design.repeats, last, chosen)
+        if step >= 0:
+            actions[..., step] = last
     lengths = LENGTH * design.ratio ** -random.random(shape[:2])
     lengths = np.ceil(lengths / np.where(treated, design.treated_ratio, 1.0)[:, None]).clip(min=2).astype(np.int64)
     medians = np.exp(design.spread * random.standard_normal((number, 1, size)) + np.arange(size) / 4)
@@ -148,14 +153,15 @@ def draw_study(design: Design, effect: bool, seed: int) -> RecordedPlans:
     )
 
 
-def fixed_prior() -> MarkovPrior:
-    """Return the chain of order 1 whose bits are scored: it has learned from another study."""
-    return MarkovPrior(BEHAVIOURS, 1).fit(draw_study(Design(100), False, 10**6))
+@lru_cache
+def fixed_chain(order: int) -> MarkovPrior:
+    """Return a chain whose bits are scored: it has learned from another study."""
+    return MarkovPrior(BEHAVIOURS, order).fit(draw_study(Design(100), False, 10**6))
 
 
 def p_values(plans: RecordedPlans, permutations: int, generator: torch.Generator) -> dict[str, float]:
     """Return the p-value of each test: of its smallest corrected one, where it has several."""
-    bits, mask = action_bits(fixed_prior(), plans), plans.mask()
+    bits, mask = action_bits(fixed_chain(1), plans), plans.mask()
     within, between = (
         transitions(plans, permutations, generator),
         transitions(plans, permutations, generator, by="condition"),
@@ -185,7 +191,7 @@ def p_values(plans: RecordedPlans, permutations: int, generator: torch.Generator
 
 def intervals(plans: RecordedPlans, permutations: int, generator: torch.Generator) -> dict[str, tuple[float, ...]]:
     """Return estimates, each with the ends of its interval."""
-    prior, mask = fixed_prior(), plans.mask()
+    prior, mask = fixed_chain(1), plans.mask()
     bits = action_bits(prior, plans)
     within, conditions = transitions(plans, 1, generator), compare_conditions(plans, permutations, generator)
     between = transitions(plans, 1, generator, by="condition")
@@ -201,16 +207,16 @@ def intervals(plans: RecordedPlans, permutations: int, generator: torch.Generato
     if "1" in survival.ratios:
         found["survival, times as long"] = tuple(survival.ratios["1"])
     curve = survival.curves["1", "saline"]
-    at = int(np.searchsorted(curve.time, 1.5)) - 1
-    found["survival after 1.5 s"] = (float(curve.survival[at]), float(curve.low[at]), float(curve.high[at]))
-    for one in motifs(plans, (3,)):
-        if one.actions in ((0, 1, 2), (1, 1, 1)):
-            found["motif " + " ".join(map(str, one.actions))] = (one.ratio, one.low, one.high)
+    late = int(np.searchsorted(curve.time, 1.5)) - 1
+    found["survival after 1.5 s"] = (float(curve.survival[late]), float(curve.low[late]), float(curve.high[late]))
+    for motif in motifs(plans, (3,)):
+        if motif.actions in ((0, 1, 2), (1, 1, 1)):
+            found["motif " + " ".join(map(str, motif.actions))] = (motif.ratio, motif.low, motif.high)
     drift = rate_drift(plans)
     found["drift of behaviour 0"] = drift.changes[list(drift.behaviours).index("0")][:3]
     known = score("chain", prior, plans)
     found["bits of a chain"] = known.bits_per_action()[:3]
-    found["bits less than another's"] = known.minus(score("uniform", UniformPrior(BEHAVIOURS), plans))[:3]
+    found["bits less than another's"] = known.minus(score("shares", fixed_chain(0), plans))[:3]
     found["trend in sequences"] = by_position(plans, bits, mask).trend[:3]
     return found
 
@@ -288,8 +294,7 @@ def true_values(batch: Batch) -> dict[str, float]:
         plans = draw_study(design, batch.effect, 10**7 + number)
         values = intervals(plans, 1, torch.Generator().manual_seed(number))
         estimates.append({name: estimate for name, (estimate, *_) in values.items()})
-    means: dict[str, float] = pd.DataFrame(estimates).mean().to_dict()
-    return means
+    return {str(name): float(mean) for name, mean in pd.DataFrame(estimates).mean().items()}
 
 
 def calibrated(permutations: int, seed: int, batch: Batch) -> list[tuple[Any, ...]]:

@@ -82,6 +82,15 @@ def area(time, ended, weight, limit):
     return total + share * (limit - last)
 
 
+def test_the_ratio_of_bouts_that_all_ended_is_that_of_their_means():
+    plans = replace(censored(3, 7, 2.0), cut_off=None)
+    rest, drug = (plans.actions == 0) & plans.mask(), plans.condition.bool()
+    means = [plans.durations[rest & under[:, None]].double().mean() for under in (~drug, drug)]
+    ratio, low, high = duration_survival(plans, 99, seeded(0)).ratios["rest"]
+    assert ratio == pytest.approx(float(means[1] / means[0]))
+    assert low < ratio < high
+
+
 @pytest.mark.parametrize("kind", ["between", "strata", "within"])
 def test_ratios_of_restricted_means_leave_out_a_subject(kind):
     """In strata of unequal sizes, and in pairs, in plain loops: each subject counts once more where others are few."""
@@ -96,7 +105,8 @@ def test_ratios_of_restricted_means_leave_out_a_subject(kind):
     cell = [number % 2 if kind == "strata" else 0 for number in range(subjects)]
     treated = [int(condition[unit == number][0]) for number in range(subjects)]
     inside = rest & (unit < subjects)
-    limit = min(time[inside & (condition == c)].max() for c in (0, 1))
+    longest = [max(np.flatnonzero(inside & (condition == c)), key=lambda row: time[row]) for c in (0, 1)]
+    limit = min([time[row] for row in longest if not ended[row]], default=time[longest].max())
 
     def change(out):
         logs = []

@@ -52,7 +52,7 @@ class DurationSurvival:
         tests: by behaviour the log-rank test's p-value, and that corrected for the number of behaviours; empty where
             nothing can be tested.
         ratios: of two conditions, by behaviour: how many times as long its bouts last under the second as under the
-            first (restricted means), with its 95 % interval over units; empty where nothing can be tested.
+            first, with its 95 % interval over units; empty where nothing can be tested.
         design: what was permuted; None without conditions.
     """
 
@@ -98,7 +98,8 @@ def duration_survival(
     (jackknife), on the scale log(-log S). The test is the log-rank test (Mantel 1966): observed less expected ends,
     where what is expected is the hazard of the stratum, or in paired designs of the subject. Its null distribution is
     that of permuted conditions of whole units (see `PermutationDesign`), so that bouts of a subject may be alike.
-    The ratio is of the areas below the two curves, up to the longest bout of the condition whose bouts are shorter.
+    The ratio is of the areas below the two curves: of mean durations, up to the longest bout of a condition where this
+    one was cut off.
     Units count so that each stratum has the same weight under both conditions.
 
     Args:
@@ -209,10 +210,13 @@ def _log_rank(ends: Array, expected: Array, labels: torch.Tensor, conditions: in
 
 
 def _ratio_of_means(time: Array, ended: NDArray[np.bool_], block: Numbers, design: PermutationDesign) -> Interval:
-    """Return the ratio of restricted means, the second condition by the first; the interval leaves out one unit."""
+    """Return the ratio of mean durations, the second condition by the first; the interval leaves out one unit."""
     unit, label, cell = (one.numpy() for one in (design.unit, design.label, design.cell))
     units, under = len(design.units), label[block]
-    limit = min(time[under == condition].max() for condition in (0, 1))
+    # Up to the end, unless the longest bout of a condition was cut off: beyond it nothing is known of this condition.
+    last = [time[under == condition].max() for condition in (0, 1)]
+    known = [ended[(under == condition) & (time == last[condition])].all() for condition in (0, 1)]
+    limit = min((longest for longest, whole in zip(last, known, strict=True) if not whole), default=max(last))
     kept = np.arange(units) != np.arange(-1, units)[:, None]  # [G + 1, G]: all, then without each unit
     logs = []
     for condition in (0, 1):

@@ -326,6 +326,7 @@ def _document(
         results={
             "reference": None if found.reference is None else found.reference[1],
             "unit": found.unit,
+            "not_trained": dict(found.promises),
             "file": {"name": file, **describe(found.plans)},
             "findings": [finding.row() for finding in findings],
         },

@@ -2,7 +2,7 @@
 
 import errno
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from math import log
 from pathlib import Path
@@ -80,6 +80,7 @@ class Evaluation:
     first_fold: RecordedPlans  # the plans that are held out in the first fold
     gains: pd.DataFrame  # the information by lag that models give
     settings: dict[str, Any]  # how it was made
+    promises: Mapping[str, float] = field(default_factory=dict)  # bits per action, of networks that were not trained
     recordings: Recordings | None = None  # that the plans are fragments of
 
     @cached_property
@@ -176,8 +177,7 @@ def evaluate(
     gains.sort(key=lambda row: (row["context"] == CONTEXT, row["model"] != COUNTED))
     table = pd.DataFrame(gains)
     reference = None if best is None else (best, f"{best.name} ({best.inputs})")
-    settings = asdict(design) | ({"promises": promises} if promises else {})
-    return Evaluation(plans, scored, mask, models, reference, scored[held_out[0]], table, settings)
+    return Evaluation(plans, scored, mask, models, reference, scored[held_out[0]], table, asdict(design), promises)
 
 
 def _gains(arrays: Arrays, inputs: str) -> list[dict[str, Any]]:

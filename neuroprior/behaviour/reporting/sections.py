@@ -149,10 +149,9 @@ def score_section(found: Evaluation) -> Part | None:
 
 def _not_trained(found: Evaluation) -> list[str]:
     """Sentences on the networks that promised too little to be trained."""
-    promises = found.settings.get("promises", {})
-    if not promises:
+    if not found.promises:
         return []
-    names = listed([f"{name.replace(',', '')} ({max(bits, 0):.4f})" for name, bits in promises.items()])
+    names = listed([f"{name.replace(',', '')} ({max(bits, 0):.4f})" for name, bits in found.promises.items()])
     return [
         "Networks are trained where a tenth of their training, in the first fold, promises enough to be kept. Not"
         f" trained, with the bits per behaviour that they promised at most: {names}. `--effort full` trains all."

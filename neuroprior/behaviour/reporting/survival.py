@@ -64,7 +64,7 @@ def survival_table(result: DurationSurvival, few: str) -> Table:
     caption = "Medians of bouts, of which some were cut off by the end of watching (Kaplan-Meier)."
     if result.ratios:
         columns["ratio"] = lambda row: f"{row.ratio:.3g} ({row.low:.3g} to {row.high:.3g})"
-        caption += " ratio: of restricted means, the second by the first, with its 95 % interval."
+        caption += " ratio: of mean durations, the second by the first, with its 95 % interval."
     if result.tests and not few:
         columns["p"] = lambda row: (
             "" if np.isnan(row.corrected) else p_text(row.corrected) + "*" * (row.corrected < LEVEL)
