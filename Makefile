@@ -5,7 +5,7 @@ BIN := .venv/bin
 PYTEST := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 export PYTHONPATH :=
 
-.PHONY: paper mice mice-planner results test check style types pytest slow bench docs clean
+.PHONY: paper mice mice-planner results test check style types pytest slow mutants bench docs clean
 
 paper: .venv/cli
 	$(BIN)/python -m eval paper
@@ -38,6 +38,10 @@ pytest: .venv/dev
 # What takes too long for each change: to be run before a release, and after changes to what is learned.
 slow: .venv/dev
 	$(PYTEST) -m slow
+
+# Faults planted in the library, and which of them the tests catch: another sample each time, an hour or two.
+mutants: .venv/dev
+	$(BIN)/python -m tests.support.mutants
 
 bench: .venv/bench
 	$(BIN)/python -m eval bench

@@ -24,9 +24,9 @@ WIDTH = 160
 def render_summary(recordings: Any) -> str:
     """Return the text of what `describe` yields; see `Recordings.summary`."""
     text = StringIO()
-    console = Console(file=text, width=WIDTH, highlight=False)
+    console = Console(file=text, width=WIDTH, highlight=False, markup=False)
     for line in describe(recordings):
-        console.print(line, markup=False, soft_wrap=True) if isinstance(line, str) else console.print(line)
+        console.print(line, soft_wrap=isinstance(line, str))
     return text.getvalue()
 
 

@@ -20,14 +20,14 @@ def check(files: list[str], reading: Options = Options()) -> None:  # noqa: B008
     Raises:
         ValueError: the files cannot be read; each problem is printed before.
     """
-    console = Console(soft_wrap=True, highlight=False)
+    console = Console(soft_wrap=True, highlight=False, markup=False)
     try:
         recordings = read_recordings(files, reading)
     except ReadingError as error:
         for problem in error.problems:
-            console.print(f"problem: {problem}", markup=False)
+            console.print(f"problem: {problem}")
         raise ValueError(f"nothing is read, because of {len(error.problems)} problems") from None
     for line in describe(recordings):
-        console.print(line, markup=False) if isinstance(line, str) else console.print(line)
+        console.print(line)
     words = [*files, *reading_words(reading)]
-    console.print(f"\nnext: neuroprior report {shlex.join(words)}", markup=False)
+    console.print(f"\nnext: neuroprior report {shlex.join(words)}")

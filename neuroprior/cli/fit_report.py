@@ -40,7 +40,7 @@ def report(
         fresh: the prior before training, for a cross-validation.
         settings: of its `fit` there.
     """
-    console = Console()
+    console = Console(markup=False)
     prior, name = prior.cpu().eval(), name_of(prior)
     save(prior, folder)
     if data.past_durations is not None and prior.takes_context:

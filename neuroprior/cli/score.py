@@ -77,9 +77,9 @@ def score(
     if plans.action_names is None and known is not None:
         notes.append(taken_note("actions", known))
     place.mkdir(parents=True, exist_ok=True)
-    console = Console()
+    console = Console(markup=False)
     for note in notes:
-        console.print(f"note: {note}", highlight=False, markup=False, soft_wrap=True)
+        console.print(f"note: {note}", highlight=False, soft_wrap=True)
     console.print(
         printed(f"{name_files(files)} under {folder}", table(frame.head(MOST_ROWS), first | numbers, caption))
     )

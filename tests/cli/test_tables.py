@@ -107,3 +107,18 @@ def test_the_large_example_is_read_and_checked(tmp_path, capsys):
     assert main(["check", place, "--columns.observer", "observer"]) == 0
     assert "24 recordings of 24 subjects" in capsys.readouterr().out
     assert main(["example", str(tmp_path / "other.csv"), "--study", "huge"]) == 2
+
+
+def test_names_are_printed_as_they_are_written(tmp_path, monkeypatch, capsys):
+    """What stands in brackets is no style of the terminal."""
+    monkeypatch.chdir(tmp_path)
+    rows = [("m1 [red]", ("walk [fast]", "rest")[t % 2], t) for t in range(9)]
+    pd.DataFrame(rows, columns=["animal", "behaviour", "t"]).to_csv("lab [bold].csv", index=False)
+    columns = ["--columns.behaviour", "behaviour", "--columns.start", "t"]
+    assert main(["check", "lab [bold].csv", *columns]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "walk [fast]" in said
+    assert "lab [bold].csv" in said
+    Path("lab [bold].csv").write_text("animal,behaviour,t\nm1,walk,x\nm1,rest,2\n")
+    assert main(["check", "lab [bold].csv", *columns]) == 2
+    assert "lab [bold].csv" in capsys.readouterr().out

@@ -26,7 +26,6 @@ from neuroprior.priors import (
     UniformPrior,
     fit,
 )
-from neuroprior.priors.fitting import PRIORS
 from neuroprior.priors.serialization import load, save
 from neuroprior.training import Settings
 from tests.support.sources import refuses, seeded
@@ -223,18 +222,6 @@ def test_actions_alone_are_plans_without_context(name):
         assert torch.equal(method(actions.long()), method(Plans(actions, A)))
     with refuses("context"):
         MarkovPrior(A, 1, num_contexts=C).log_prob(actions)
-
-
-@pytest.mark.parametrize("name", list(PRIORS))
-def test_fit_by_name(name, monkeypatch):
-    # Chains of the first orders alone: most of the time of the combined prior is that of counting for all of them.
-    monkeypatch.setattr("neuroprior.priors.ensembles.candidates.ORDERS", range(3))
-    plans = plans_for(COUNTS["markov context"]())
-    quick = QUICK if name in ("gru", "transformer", "stacked", "mixture", "combined") else {}
-    prior = fit(plans, name, generator=seeded(0), **quick)
-    assert prior.num_actions == A
-    assert prior.num_contexts == (None if name == "uniform" else C)
-    assert prior.log_prob(plans if prior.takes_context else plans.actions).isfinite().all()
 
 
 def test_fit_makes_a_prior_for_the_plans():

@@ -38,20 +38,20 @@ def plans(
     if typed[:1] not in (["plans"], ["report"]):  # called from Python
         program, typed = "__main__.py", ["plans", *plans]
     command = f"{program.replace('__main__.py', 'python -m eval')} {shlex.join(typed)}"
-    console, page = Console(), Path(out) / PAGE
+    console, page = Console(markup=False), Path(out) / PAGE
     shown = False
 
     def show_first(document: Document) -> None:
         nonlocal shown
         if document.status and not shown:
             show_headline(document, console)
-            console.print(f"report: {page}. {document.status}", highlight=False, markup=False, soft_wrap=True)
+            console.print(f"report: {page}. {document.status}", highlight=False, soft_wrap=True)
             shown = True
 
     given: dict[str, Any] = {"priors": priors, "test": test, "skip": skip, "fits": fits, "reading": reading}
     document = report(plans, out=out, figures=figures, command=command, each=show_first, **given)
     show(document, console)
-    console.print(f"report: {page}", highlight=False, markup=False, soft_wrap=True)
+    console.print(f"report: {page}", highlight=False, soft_wrap=True)
 
 
 def _describe_options() -> str:

@@ -17,7 +17,6 @@ import rich.table
 from matplotlib.figure import Figure
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.markup import escape
 from rich.text import Text
 
 from neuroprior._files import read_json, versions, write_json, write_whole, written_whole
@@ -104,7 +103,7 @@ def publish(document: Document, folder: Path, console: Console | None = None) ->
         Order 1 is best.
         report: runs/chains/report.html
     """
-    console = console or Console()
+    console = console or Console(markup=False)
     show(document, console)
     write_document(document, folder)
     console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
@@ -257,10 +256,11 @@ def _cell(row: Any, column: Column) -> str:
 
 def printed(title: str, table: Table) -> rich.table.Table:
     """A table for a terminal of 80 columns: names are folded where there is no room, numbers are not."""
-    made = rich.table.Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title=escape(title))
+    made = rich.table.Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title=Text(title, "table.title"))
     for heading, side in zip(table.headings, table.align or "", strict=True):
-        made.add_column(heading, justify="left" if side == "l" else "right", no_wrap=side == "r", overflow="fold")
+        name = Text(heading, "table.header")
+        made.add_column(name, justify="left" if side == "l" else "right", no_wrap=side == "r", overflow="fold")
     for row in table.rows:
         made.add_row(*map(Text, row))  # names are no markup
-    made.caption = escape(table.caption)
+    made.caption = Text(table.caption, "table.caption")
     return made

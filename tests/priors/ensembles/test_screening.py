@@ -41,6 +41,7 @@ def test_a_network_promises_what_counts_cannot_see():
     promise = screen(network, forecasts, learned, held_out, SILENT)
     assert promise.pays
     assert promise.late > 0.01
+    assert promise.doublings == 2  # two trainings of 50 steps, of 400 in all
     assert not network.sized
     assert all(torch.equal(values, network.state_dict()[name]) for name, values in before.items())
 
