@@ -32,6 +32,9 @@ WINGS = ("behaviour", "control", "puzzles")
 MAX_SECONDS, STARTING_SECONDS = 90.0, 60.0
 """Of tests that are run for a fault, as long as they take without it; and added before it is said to hang."""
 
+NOT_RUN = (4, 5)
+"""Exit codes of pytest where a test that it was given does not exist."""
+
 SWAPPED_NAMES = {
     name: other
     for pair in ("any all", "min max", "argmin argmax", "amin amax", "sum mean", "floor ceil", "cumsum cumprod")
@@ -248,6 +251,8 @@ def _first_failure(copy: Path, tests: list[str], limit: float) -> str:
         )
     except subprocess.TimeoutExpired:
         return "no end"
+    if done.returncode in NOT_RUN:
+        raise RuntimeError(f"tests are others than when the coverage was measured; delete it\n{done.stdout[-1000:]}")
     if done.returncode == 0:
         return ""
     named = re.search(r"^(?:FAILED|ERROR) (\S.*?)(?: - .*)?$", done.stdout, re.MULTILINE)

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from eval.__main__ import main
-from eval.study import command
+from eval.study import calibration, command
 from eval.study.time_tests import SOURCES, timed_study
 from neuroprior.behaviour import read
 
@@ -110,3 +110,37 @@ def test_studies_of_time_are_what_they_say():
 def test_bad_numbers(tmp_path, capsys):
     assert main(["study", "--actions", "0", "--out", str(tmp_path)]) == 2
     assert "actions" in capsys.readouterr().err
+
+
+def test_calibration_counts_what_is_missed(tmp_path, monkeypatch, capsys):
+    """Small designs: shares are of all their studies."""
+    small = {"8 subjects": calibration.Design(8, ratio=3.0), "hidden modes": calibration.Design(7, modes=True)}
+    for name, value in {"DESIGNS": small, "TOGETHER": 2, "MANY": 9, "REPEATED": 2}.items():
+        monkeypatch.setattr(calibration, name, value)
+    options = ["calibration", "--studies", "3", "--permutations", "99", "--processes", "1", "--out", str(tmp_path)]
+    assert main(options) == 0
+    rows = pd.read_csv(tmp_path / "shares.csv")
+    assert {*rows["design"]} == {*small}
+    assert {*rows["studies"]} <= {1, 2, 3, 4}  # rounded up; fewer where nothing can be tested
+    assert (rows["low"] <= rows["share"]).all()
+    assert (rows["share"] <= rows["high"]).all()
+    known = rows.set_index(["kind", "name", "effect", "design"]).sort_index()["share"]
+    assert known["interval", "bits of a chain"].max() > 0
+    assert "Tests without an effect" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("effect", [False, True])
+def test_designs_are_as_they_say(effect):
+    """Lengths within and between subjects, repeats, and what the treatment changes."""
+    plans = calibration.draw_study(calibration.Design(60, ratio=10.0, treated_ratio=4.0, repeats=0.8), effect, 3)
+    treated, lengths = plans.condition.bool(), plans.lengths.double()
+    assert int(treated.sum()) == 40  # a third of 60 subjects, two sessions each
+    assert 3 < float(lengths[~treated].mean() / lengths[treated].mean()) < 5
+    assert lengths[~treated].max() > 5 * lengths[~treated].min()
+    first, second = plans.actions[:, :-1], plans.actions[:, 1:]
+    mask = plans.mask()[:, 1:]
+    assert 0.8 < float((first == second)[mask].double().mean()) < 0.9
+    longer = [
+        plans.durations[(plans.actions == 1) & plans.mask() & one[:, None]].log().mean() for one in (~treated, treated)
+    ]
+    assert float(longer[1] - longer[0]) == pytest.approx(calibration.EFFECT * effect, abs=0.25)
