@@ -1,9 +1,19 @@
 """Every planner passes `check_planner`, and planners that break a rule do not."""
 
+from inspect import isabstract
+
 import pytest
 import torch
 
-from neuroprior import ExhaustivePlanner, MCTSPlanner, Planner, SamplingPlanner, TabularWorld
+from neuroprior import (
+    ExhaustivePlanner,
+    MCTSPlanner,
+    Planner,
+    SamplingPlanner,
+    TabularWorld,
+    UniformPrior,
+    planners,
+)
 from neuroprior.planners import Decision, FrontierPlanner
 from neuroprior.testing import check_planner
 from tests.support.sources import TablePrior, refuses, seeded
@@ -26,6 +36,12 @@ PLANNERS = {
 @pytest.mark.parametrize("make", PLANNERS.values(), ids=PLANNERS)
 def test_planners_conform(make, how):
     check_planner(lambda prior, length, number: make(prior, length, number, **how))
+
+
+def test_no_planner_is_left_out():
+    exported = {getattr(planners, name) for name in planners.__all__}
+    kinds = {one for one in exported if isinstance(one, type) and issubclass(one, Planner) and not isabstract(one)}
+    assert kinds == {type(make(UniformPrior(2), 2, 3)) for make in PLANNERS.values()}
 
 
 @pytest.mark.parametrize("make", [MCTSPlanner])

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from inspect import isabstract
 from typing import Self
 
 import numpy as np
@@ -22,6 +23,8 @@ from neuroprior import (
     World,
     from_gymnasium,
     gridworld,
+    puzzles,
+    worlds,
 )
 from neuroprior.behaviour import RecordedPlans, SemiMarkovPrior
 from neuroprior.priors import AdaptivePrior
@@ -101,47 +104,35 @@ def legal_world() -> TabularWorld:
     return TabularWorld(torch.tensor([[1, 2], [0, 0], [2, 0]]), torch.rand(2, 3, 2), legal)
 
 
-@pytest.mark.parametrize(
-    "world",
-    [
-        gridworld(5, 4, "wall", num_worlds=3),
-        gridworld(20, 20, "torus"),
-        gridworld(1, 1),
-        legal_world(),
-        cube(),
-        cube("quarter", scramble=3),
-        stochastic_world(0),
-        maze(7, 9, num_layouts=3, num_worlds=2),
-        four_rooms(egocentric=True, view=2, reward="goal"),
-        egocentric(gridworld(5, 5, "torus")),
-        from_gymnasium("Taxi-v4"),
-        from_gymnasium("FrozenLake-v1", starts="any"),
-        from_gymnasium("CartPole-v1", seeds=range(3)),
-        sokoban(SOKOBAN),
-        sliding_tiles(shape=(3, 3)),
-        sliding_tiles(shape=(2, 4), scramble=5),
-    ],
-    ids=[
-        "walls",
-        "torus",
-        "one cell",
-        "legal",
-        "cube",
-        "cube, quarter turns",
-        "chance",
-        "maze",
-        "four rooms",
-        "egocentric",
-        "taxi",
-        "ice",
-        "cart and pole",
-        "sokoban",
-        "sliding tiles",
-        "sliding tiles, no square",
-    ],
-)
+WORLDS = {
+    "walls": gridworld(5, 4, "wall", num_worlds=3),
+    "torus": gridworld(20, 20, "torus"),
+    "one cell": gridworld(1, 1),
+    "legal": legal_world(),
+    "cube": cube(),
+    "cube, quarter turns": cube("quarter", scramble=3),
+    "chance": stochastic_world(0),
+    "maze": maze(7, 9, num_layouts=3, num_worlds=2),
+    "four rooms": four_rooms(egocentric=True, view=2, reward="goal"),
+    "egocentric": egocentric(gridworld(5, 5, "torus")),
+    "taxi": from_gymnasium("Taxi-v4"),
+    "ice": from_gymnasium("FrozenLake-v1", starts="any"),
+    "cart and pole": from_gymnasium("CartPole-v1", seeds=range(3)),
+    "sokoban": sokoban(SOKOBAN),
+    "sliding tiles": sliding_tiles(shape=(3, 3)),
+    "sliding tiles, no square": sliding_tiles(shape=(2, 4), scramble=5),
+}
+
+
+@pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS)
 def test_every_world_conforms(world: World) -> None:
     check_world(world)
+
+
+def test_no_world_is_left_out() -> None:
+    exported = {getattr(room, name) for room in (worlds, puzzles) for name in room.__all__}
+    kinds = {kind for kind in exported if isinstance(kind, type) and issubclass(kind, World) and not isabstract(kind)}
+    assert kinds == {type(world) for world in WORLDS.values()}
 
 
 class Broken(MarkovPrior):
