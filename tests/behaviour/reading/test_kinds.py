@@ -350,3 +350,12 @@ def test_bad_options_are_one_line(study):
     ):
         with pytest.raises(ValueError, match=words):
             study("animal,behaviour,start\nm1,a,0\nm1,b,2\n", **options)
+
+
+def test_focal_data_of_jwatcher(study):
+    """What stands above the first line of data is none; the end of the session is no behaviour."""
+    above = "FirstLineOfData=5\n# Format: Focal Data File Version 1.0\nFocalAnimal=ant 7\n# ----\n"
+    found = study(above + "0,f\n1500, r\n\n4250,f\n6000,EOF\n", name="ant 7.dat")
+    assert rows(found) == [("ant 7", "f", 0.0, None), ("ant 7", "r", 1500.0, None), ("ant 7", "f", 4250.0, None)]
+    assert found.unit == "ms"
+    assert any("JWatcher" in note for note in found.notes)
