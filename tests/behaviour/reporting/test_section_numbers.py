@@ -139,6 +139,14 @@ def test_how_far_back_is_of_what_counts(plans, skip):
     assert [one.p_corrected for one in part.findings] == result.corrected.tolist()
 
 
+def test_few_groups_bear_no_verdict_on_how_far_back(plans):
+    few = plans[plans.group < 3]
+    part = lag_section(evaluate_saved({"uniform": UniformPrior(3)}, few, 0))
+    assert part.verdicts == []
+    assert not any(one.starred or "How far back" in one.sentence for one in part.findings)
+    assert any(how_far_back(few).few in sentence for sentence in part.section.text)
+
+
 def test_where_no_pair_of_actions_counts_there_is_no_section():
     plans = RecordedPlans.of(markov_plans(markov_probs(3, 1, 0), 8, 6, 1))
     assert lag_section(evaluate_saved({"uniform": UniformPrior(3)}, replace(plans, group=None), 5)) is not None
