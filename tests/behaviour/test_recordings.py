@@ -56,6 +56,13 @@ def test_plans_are_fragments_with_recording_group_condition_and_times():
     assert len(read(TABLE).plans()) == 4
 
 
+def test_a_summary_lists_all_behaviours_and_the_first_events():
+    many = pd.DataFrame({"animal": "m1", "behaviour": [f"b{n:02d}" for n in range(45)], "start": range(45)})
+    said = read(many).summary()
+    assert all(f"b{n:02d} " in said for n in range(45))
+    assert said.count("b00 ") > said.count("b44 ")
+
+
 def test_time_budgets_are_shares_of_the_watched_time():
     budget = read(TABLE).time_budget()
     assert budget.loc["m1"].to_dict() == pytest.approx({"eat": 1 / 10, "rest": 4 / 10, "walk": 5 / 10})
