@@ -71,7 +71,7 @@ class Reach(NamedTuple):
     compiled: dict[str, list[tuple[int, int, str]]]
 
     def of(self, fault: Fault) -> list[str]:
-        """The tests that reach a fault, up to `MAX_SECONDS`: those of its own room first, the quickest before others."""
+        """The tests that reach a fault, up to `MAX_SECONDS`: those of its own room first, and quick ones."""
         chosen, left, rooms = [], MAX_SECONDS, set(re.split(r"[/_.]", fault.file))
 
         def rank(test: str) -> tuple[int, float]:
