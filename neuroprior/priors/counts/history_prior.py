@@ -49,6 +49,8 @@ class HistoryPrior(Prior):
     tables: tuple[str, ...] = _TABLES
     """The names of the buffers whose sizes depend on what was learned."""
 
+    log_tables = ("log_probs",)
+
     openings = True
     """Whether all actions since a plan's beginning are a history of their own."""
 
