@@ -9,7 +9,7 @@ import json
 import operator
 import os
 from collections.abc import Callable, Iterator, Mapping
-from math import isfinite
+from math import inf, isfinite
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
@@ -35,8 +35,8 @@ ENTRIES = {"format": str, "version": int, "prior": str, "config": dict, "learned
 MAX_DEPTH, MAX_PRIORS, MAX_INTEGER = 100, 1000, 2**63 - 1
 """Of a configuration: how deep it is nested, how many priors it describes, and the size of its integers."""
 
-SPARE = 2**26
-"""Bytes that a prior may take beyond the size of its file."""
+SPARE, TIMES = 2**24, 16
+"""A prior may take so many bytes, and so many times the size of its tensors: phases take more than tables."""
 
 SECONDS = 30.0
 """For which a writer waits for others that write to the same folder."""
@@ -230,8 +230,7 @@ def _make(content: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> SavedMod
     """The prior that a configuration describes, with these tensors; ValueError unless they are those of such a one."""
     name = content["prior"]
     try:
-        # A prior is not larger than its file, but for the tables of counts, which are still empty.
-        with memory_within(SPARE + sum(value.nbytes for value in tensors.values())):
+        with memory_within(SPARE + TIMES * sum(value.nbytes for value in tensors.values())):
             prior = _class_of(content)(**content["config"])
             prior.restore(content["learned"])
         same = {"config": prior.config, "learned": prior.learned}
@@ -251,13 +250,20 @@ def _make(content: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> SavedMod
             raise ValueError(
                 f"{key} must be {list(expected.shape)} of {expected.dtype}, got {list(value.shape)} of {value.dtype}"
             )
-        if value.is_floating_point() and bool((value.isnan() | value.isinf() & (key not in logs or value > 0)).any()):
+        if not _is_sound(value, key in logs):
             raise ValueError(f"{key} has numbers that are NaN or infinite")
     try:
         prior.load_state_dict(tensors)
     except RuntimeError as error:
         raise ValueError(str(error)) from error
     return prior
+
+
+def _is_sound(value: Tensor, logs: bool) -> bool:
+    """Whether a tensor is finite, but for logarithms of probabilities that are 0, of which not all in a row are."""
+    if not value.is_floating_point() or bool(value.isfinite().all()):
+        return True
+    return logs and not bool((value.isnan() | (value == inf)).any() | (value == -inf).all(-1).any())
 
 
 def _names(prior: SavedModule, attribute: str) -> set[str]:
