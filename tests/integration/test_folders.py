@@ -106,7 +106,8 @@ def another_run(folder: Path) -> Iterator[subprocess.Popen[str]]:
         process.kill()
 
 
-def test_a_folder_that_another_run_uses_is_one_line_until_it_is_killed(tmp_path, capsys):
+def test_a_folder_that_another_run_uses_is_one_line_until_it_is_killed(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("neuroprior.priors.serialization.SECONDS", 0.1)
     folder, plans = tmp_path / "run", tmp_path / "plans.npz"
     write_plans(some_plans(), plans)
     save(UniformPrior(3), tmp_path / "prior")
@@ -122,6 +123,8 @@ def test_a_folder_that_another_run_uses_is_one_line_until_it_is_killed(tmp_path,
             said = capsys.readouterr().err.splitlines()[-1]
             assert said.startswith(f"error: `out` must be a folder that no other run uses, got {folder}, in use by")
             assert f"process {process.pid} on " in said
+        with refuses(f"`folder` must be a folder that no other run uses, got {folder}, in use by process"):
+            save(UniformPrior(3), folder)
         (partial,) = folder.glob("*.partial")
         clear(folder)  # which leaves what is being written
         assert partial.exists()
