@@ -4,7 +4,9 @@ import operator
 import os
 import sys
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 from numbers import Real
 from typing import Any, TypeGuard
@@ -192,18 +194,30 @@ def check_alike_named(named: Mapping[str, Sequence[str] | None], remedy: str, wh
 
 
 def check_memory(needed: int, **arguments: object) -> None:
-    """Raise ValueError, naming the arguments, where they need more memory than the machine has.
+    """Raise ValueError, naming the arguments, where they need more memory than there is, see `memory_within`.
 
     Args:
         needed: bytes, at least.
         **arguments: those that decide it.
     """
-    there = physical_memory()
+    there = _memory.get() or physical_memory()
     if there is not None and needed > there:
         names, values = " and ".join(arguments), " and ".join(map(str, arguments.values()))
-        raise ValueError(
-            f"{names}: {values} would need at least {needed:,} bytes of memory, and this machine has {there:,}"
-        )
+        where = "this machine" if _memory.get() is None else "a prior of this size"
+        raise ValueError(f"{names}: {values} would need at least {needed:,} bytes of memory, and {where} has {there:,}")
+
+
+_memory: ContextVar[int | None] = ContextVar("memory", default=None)
+
+
+@contextmanager
+def memory_within(most: int) -> Iterator[None]:
+    """Let `check_memory` allow no more than so many bytes, whatever the machine has."""
+    token = _memory.set(most)
+    try:
+        yield
+    finally:
+        _memory.reset(token)
 
 
 @cache

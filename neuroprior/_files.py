@@ -1,16 +1,23 @@
 """Writing results: CSV and JSON, each to a temporary name first and renamed when whole."""
 
+import errno
 import json
 import math
 import os
 import platform
+import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from secrets import token_hex
 from typing import IO, Any
 
 from neuroprior._version import __version__
+
+PARTIAL = ".partial"
+"""The ending of temporary files."""
 
 MISSING_LABELS = (
     "", "nan", "na", "n/a", "n.a.", "<na>", "null", "?", "-", "#n/a", "#value!", "#ref!", "#name?", "#div/0!",
@@ -33,7 +40,7 @@ def read_json(path: Path) -> Any:
     """
     try:
         return json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: not JSON ({error})") from error
 
 
@@ -53,7 +60,18 @@ def write_whole(path: Path, content: bytes) -> None:
 
 @contextmanager
 def written_whole(path: Path, mode: str = "w") -> Iterator[IO[Any]]:
-    """A file opened for writing beside its place, and moved there when the block ends without an error.
+    """A file opened for writing beside its place, and moved there when the block ends without an error."""
+    text = {} if "b" in mode else {"encoding": "utf-8", "newline": ""}
+    with replacing(path) as partial, open(partial, mode, **text) as file:  # type: ignore[call-overload]
+        yield file
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A new file of a random name beside `path`, which takes its place when the block ends without an error.
+
+    It is locked as long as it is written: what is left by a process that was killed is told by that it is not, and
+    `clear` removes it.
 
     Raises:
         ValueError: the place is a directory.
@@ -61,20 +79,79 @@ def written_whole(path: Path, mode: str = "w") -> Iterator[IO[Any]]:
     """
     if path.is_dir():
         raise ValueError(f"{path}: a directory; the name of a file is expected")
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")  # another process may write the same file
-    text = {} if "b" in mode else {"encoding": "utf-8", "newline": ""}
     try:
-        with open(partial, mode, **text) as file:  # type: ignore[call-overload]
-            yield file
-        os.replace(partial, path)
+        partial, descriptor = _new_partial(path.parent)
+        try:
+            yield partial
+            os.replace(partial, path)
+        finally:
+            with suppress(OSError):
+                partial.unlink()
+            if descriptor is not None:
+                os.close(descriptor)
     except OSError as error:
         # A full disk error does not name the file, and that of an encoder has no number.
         if error.errno is None:
             raise OSError(f"{path}: {error}") from error
         raise OSError(error.errno, error.strerror, str(path)) from error
-    finally:
+
+
+def _new_partial(folder: Path) -> tuple[Path, int | None]:
+    """A new file of a name that nobody can guess, and what holds its lock; None where open files cannot be renamed."""
+    while True:
+        partial = folder / f".{token_hex(8)}{PARTIAL}"
+        descriptor = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+        if sys.platform == "win32":
+            os.close(descriptor)
+            return partial, None
+        lock(descriptor)
+        if is_at(descriptor, partial):
+            return partial, descriptor
+        os.close(descriptor)  # `clear` was faster
+
+
+def clear(folder: Path) -> None:
+    """Remove the temporary files in a folder whose writers were killed; those that are being written stay."""
+    for path in folder.glob(f".*{PARTIAL}"):
+        if re.fullmatch(rf"\.[0-9a-f]{{16}}{re.escape(PARTIAL)}", path.name) is None:
+            continue
         with suppress(OSError):
-            partial.unlink(missing_ok=True)
+            if sys.platform == "win32":  # where a file that is open cannot be removed
+                path.unlink()
+                continue
+            descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
+            try:
+                if lock(descriptor):
+                    path.unlink()
+            finally:
+                os.close(descriptor)
+
+
+def lock(descriptor: int) -> bool | None:
+    """Lock an open file until it is closed, also by the end of the process, however it ends.
+
+    Returns:
+        False where another one has locked it; None where its file system has no locks.
+    """
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        return False if error.errno in (errno.EAGAIN, errno.EACCES, errno.EDEADLK) else None
+    return True
+
+
+def is_at(descriptor: int, path: Path) -> bool:
+    """Whether an open file is still the one at `path`."""
+    with suppress(OSError):
+        return os.path.samestat(os.fstat(descriptor), os.lstat(path))
+    return False
 
 
 def versions(*more: str) -> dict[str, str]:

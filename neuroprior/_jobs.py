@@ -16,7 +16,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from neuroprior._files import read_json, versions, write_json
+from neuroprior._files import clear, read_json, versions, write_json
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -129,6 +129,7 @@ class JobRun(Generic[Job, Result]):
         if not missing:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
+        clear(self.folder)
         write_json(self.folder / "asked.json", self._asked)
         processes = min(processes or os.cpu_count() or 1, len(missing))
         costs = [cost(job) for job in missing]

@@ -5,7 +5,8 @@ import torch
 
 from neuroprior import GRUPrior, MarkovPrior, SamplingPlanner, TransformerPrior, UniformPrior, collect, gridworld
 from neuroprior._checks import physical_memory
-from neuroprior.priors import StackedPrior
+from neuroprior.control import VectorGRU
+from neuroprior.priors import ContextTreePrior, StackedPrior, SwitchingPrior
 from neuroprior.sampling import sample_in_world
 from neuroprior.worlds import cube
 from tests.support.sources import refuses
@@ -25,9 +26,7 @@ PRIOR = UniformPrior(4)
         (lambda: SamplingPlanner(PRIOR, 10**7, 10**9), ["length and num_plans"]),
         (lambda: collect(SamplingPlanner(PRIOR, 2, 3), gridworld(3, 3), 10**13), ["num_plans: 10000000000000 "]),
         (lambda: GRUPrior(3, hidden_size=10**7), ["hidden_size", "2,400,000,000,000,000 bytes"]),
-        (lambda: GRUPrior(3, num_layers=10**12), ["num_layers"]),
         (lambda: GRUPrior(3, lags=10**13), ["lags"]),
-        (lambda: StackedPrior(3, num_layers=10**12), ["num_layers"]),
         (lambda: GRUPrior(3, num_contexts=10**13), ["num_contexts"]),
         (lambda: TransformerPrior(3, width=8 * 10**7), ["width"]),
         (lambda: MarkovPrior(10**14), ["num_actions"]),
@@ -39,6 +38,23 @@ PRIOR = UniformPrior(4)
 def test_what_no_machine_holds(make, words):
     with refuses(*words, "bytes of memory"):
         make()
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "most"),
+    [
+        (lambda number: GRUPrior(3, num_layers=number), "num_layers", 1000),
+        (lambda number: StackedPrior(3, num_layers=number), "num_layers", 1000),
+        (lambda number: TransformerPrior(3, num_layers=number), "num_layers", 1000),
+        (lambda number: VectorGRU([-1.0], [1.0], num_layers=number), "num_layers", 1000),
+        (lambda number: MarkovPrior(3, number), "order", 10_000),
+        (lambda number: SwitchingPrior(3, order=number), "order", 10_000),
+        (lambda number: ContextTreePrior(3, number), "depth", 10_000),
+    ],
+)
+def test_what_takes_too_long(make, name, most):
+    with refuses(f"`{name}` must be at most {most}, got {most + 1}"):
+        make(most + 1)
 
 
 def test_starts_are_counted():

@@ -15,9 +15,10 @@ from eval.bench.against import compared, read_results, regression_table
 from eval.bench.figures import peers_figure, sizes_figure
 from eval.bench.jobs import JOBS, ON_DEVICES, against_peers, on_device
 from eval.bench.timing import Rows, import_times
-from neuroprior._files import versions, write_json
+from neuroprior._files import versions
+from neuroprior._folders import claim_out
 from neuroprior._jobs import Progress
-from neuroprior.behaviour.reporting.document import Column, printed, table, write_figures, write_frames
+from neuroprior.behaviour.reporting.document import Column, printed, table, write_figures, write_frames, write_results
 from neuroprior.behaviour.reporting.page import Table
 
 LEFT = 0.5
@@ -26,6 +27,7 @@ LEFT = 0.5
 Part = Literal["peers", "sizes", "limits", "imports", "gpu"]
 
 
+@claim_out
 def bench(
     parts: Sequence[Part] = ("peers", "sizes", "limits", "imports", "gpu"),
     jobs: Sequence[str] = tuple(JOBS),
@@ -62,7 +64,6 @@ def bench(
     if not 0 < scale <= 1:
         raise ValueError(f"`scale` must be a number above 0 and at most 1, got {scale}")
     console, folder = Console(), Path(out)
-    folder.mkdir(parents=True, exist_ok=True)
     settings = {"repetitions": repetitions, "scale": scale, "threads": torch.get_num_threads()}
     works: list[tuple[str, str, Callable[[], Iterable[dict[str, Any]]]]] = []
     if "peers" in parts:
@@ -92,7 +93,7 @@ def bench(
                     # After each, so that nothing that was measured is lost.
                     write_frames(folder, {part: pd.DataFrame(found[part])})
                     keyed = {"rows" if part == "peers" else part: rows for part, rows in found.items()}
-                    write_json(folder / "results.json", {"versions": versions(), "settings": settings, **keyed})
+                    write_results(folder, {"versions": versions(), "settings": settings, **keyed})
             except ValueError as error:
                 console.print(f"{name}: left out, {error}")
             progress.advance(name)

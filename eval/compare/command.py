@@ -17,6 +17,7 @@ from eval.compare.results import Results
 from eval.compare.run import Settings, compare_run
 from eval.worlds.runs import PowerOfTwo, Seed, check_distinct, run_experiment, runs_of
 from eval.worlds.suite import TASKS, Context, WorldName, check_contexts
+from neuroprior._folders import claim_out
 from neuroprior.behaviour.reporting.document import Document
 
 KINDS = ("markov", "macro", *NEURAL, COMBINED)
@@ -26,6 +27,7 @@ Kind = Literal[KINDS]  # type: ignore[valid-type]
 TrainingStarts = restricted_number_type("TrainingStarts", int, (">=", 8), docstring="Enough to validate on some.")
 
 
+@claim_out
 def compare(
     worlds: Sequence[WorldName] = tuple(TASKS),
     seeds: PositiveInt = 20,

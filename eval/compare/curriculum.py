@@ -11,6 +11,7 @@ from eval.compare.figures import View, score_panels
 from eval.compare.run import Settings, curriculum_run
 from eval.worlds import runs
 from eval.worlds.suite import TASKS, Context, WorldName, check_contexts
+from neuroprior._folders import claim_out
 from neuroprior.behaviour.reporting.document import Document
 from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
 
@@ -21,6 +22,7 @@ PRIOR = ["world", "prior", "context"]
 NAMES = {"prior": "prior", "context": "context"}
 
 
+@claim_out
 def curriculum(
     worlds: Sequence[WorldName] = tuple(TASKS),
     lengths: Sequence[PositiveInt] | None = None,

@@ -13,6 +13,7 @@ from eval.compare.run import Contest, Settings
 from eval.worlds import runs
 from eval.worlds.starts import starts_of
 from eval.worlds.suite import TASKS, WorldName
+from neuroprior._folders import claim_out
 from neuroprior.planners import Planner, SamplingPlanner
 
 WORLDS = ("grid", "four_rooms", "egocentric", "goal_maze", "taxi", "frozen_lake")
@@ -28,6 +29,7 @@ class DepthSettings(Settings):
     length: int = 64
 
 
+@claim_out
 def depth(
     worlds: Sequence[WorldName] = WORLDS,
     num_plans: Sequence[runs.PowerOfTwo] = (4, 16, 64),

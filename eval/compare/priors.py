@@ -1,6 +1,5 @@
 """The priors of `python -m eval compare`: Markov chains with and without context, networks, and saved priors."""
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, Prior, Tabul
 from neuroprior.behaviour.analysis.comparison import score
 from neuroprior.priors.learning import plans_for, training_plans
 from neuroprior.priors.matching import numbers
+from neuroprior.priors.serialization import MODEL, digest
 
 ORDERS = range(5)
 """Orders of the Markov chains."""
@@ -189,9 +189,5 @@ def load_for(folder: str, world: str, num_actions: int, action_names: Sequence[s
 
 
 def digests(folders: Sequence[str]) -> dict[str, str]:
-    """A digest of the files of each saved prior: results of another model in the same folder do not count."""
-    files = ("config.json", "model.safetensors")
-    return {
-        folder: hashlib.sha256(b"\0".join((Path(folder) / name).read_bytes() for name in files)).hexdigest()
-        for folder in folders
-    }
+    """A digest of each saved prior: results of another model in the same folder do not count."""
+    return {folder: digest((Path(folder) / MODEL).read_bytes()) for folder in folders}

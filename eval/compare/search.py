@@ -16,6 +16,7 @@ from eval.compare.run import Contest, Contestant, Settings
 from eval.worlds import runs
 from eval.worlds.suite import TASKS, WorldName
 from neuroprior import Plans, Prior
+from neuroprior._folders import claim_out
 from neuroprior._random import draw_seed
 from neuroprior.behaviour.reporting.document import Document
 from neuroprior.behaviour.reporting.page import Section
@@ -57,6 +58,7 @@ proportion to the logarithm of the number of candidates that it takes to find th
 """
 
 
+@claim_out
 def search(
     worlds: Sequence[WorldName] = WORLDS,
     seeds: PositiveInt = 5,

@@ -27,6 +27,7 @@ from eval.control.run import (
 )
 from eval.control.tasks import CONDITIONS, TaskName, check_there
 from eval.worlds import runs
+from neuroprior._folders import claim_out
 from neuroprior._jobs import JobRun
 from neuroprior.behaviour.reporting.document import publish, write_figures
 from neuroprior.control import VectorPlans, read_vector_plans, write_vector_plans
@@ -35,6 +36,7 @@ FEW = ("half_cheetah", "arm")
 """Tasks of the default, which takes about five minutes."""
 
 
+@claim_out
 def control_experiment(
     tasks: Sequence[TaskName] = FEW,
     priors: Sequence[PriorName] = (NONE, "autoregressive", "synergies", "stored"),

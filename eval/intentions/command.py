@@ -11,6 +11,7 @@ from eval.intentions.mice import BLOCKS, STRETCH
 from eval.intentions.report import intentions_document
 from eval.intentions.run import LABYRINTH, intentions_run
 from eval.worlds import runs
+from neuroprior._folders import claim_out
 from neuroprior.behaviour.reporting.document import write_figures
 
 OFFERED = (*WORLDS, LABYRINTH)
@@ -19,6 +20,7 @@ OFFERED = (*WORLDS, LABYRINTH)
 ObservedWorld: TypeAlias = Literal[OFFERED]  # type: ignore[valid-type]
 
 
+@claim_out
 def intentions(
     worlds: Sequence[ObservedWorld] = OFFERED,
     seeds: PositiveInt = 10,

@@ -10,12 +10,14 @@ from eval.live.report import live_document
 from eval.live.run import LEARN_EVERY, PARTS, REPLAN_EVERY, LiveSettings, run_live
 from eval.live.worlds import FORAGING_WORLDS, ForagingWorldName
 from eval.worlds import runs
+from neuroprior._folders import claim_out
 from neuroprior.behaviour.reporting.document import write_figures
 
 Kind: TypeAlias = Literal[tuple(LEARN_EVERY)]  # type: ignore[valid-type]
 Items: TypeAlias = restricted_number_type("Items", int, [(">=", 1), ("<=", 8)], docstring="More takes the oracle long.")  # type: ignore[valid-type]
 
 
+@claim_out
 def live(
     worlds: Sequence[ForagingWorldName] = tuple(FORAGING_WORLDS),
     kinds: Sequence[Kind] = tuple(LEARN_EVERY),

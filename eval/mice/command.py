@@ -23,7 +23,7 @@ from eval.mice.experiment import (
 from eval.worlds.labyrinth import DATA, NODES, check_fits
 from eval.worlds.runs import check_distinct, plus_minus, table_by
 from neuroprior import read_plans
-from neuroprior._files import write_json
+from neuroprior._folders import claim_out
 from neuroprior._jobs import Progress
 from neuroprior.behaviour.reporting.document import (
     Column,
@@ -33,11 +33,13 @@ from neuroprior.behaviour.reporting.document import (
     table,
     write_figures,
     write_frames,
+    write_results,
 )
 from neuroprior.behaviour.reporting.page import Section, Table
 from neuroprior.worlds import labyrinth
 
 
+@claim_out
 def mice(
     seeds: PositiveInt = 3,
     starts: PositiveInt = 126,
@@ -70,7 +72,6 @@ def mice(
     check_distinct(num_plans=num_plans, lengths=lengths)
     settings = MiceSettings(seeds, starts, tuple(num_plans), tuple(lengths), training_plans, steps, seed)
     folder, console = Path(out), Console()
-    folder.mkdir(parents=True, exist_ok=True)
     world, plans = labyrinth(absorbing=True), read_plans(DATA)
     parts = 2 + seeds * (len(NEURAL) + len(PRIORS))
     with Progress("mice", parts, parts) as progress:
@@ -88,7 +89,7 @@ def mice(
     )
     show(document, console)
     write_frames(folder, document.frames)
-    write_json(folder / "results.json", results_of(document))
+    write_results(folder, results_of(document))
     examples = {
         "random legal moves": UNIFORM,
         "the mice's Markov prior, no context": PriorName("markov", "mice", "moves"),

@@ -26,6 +26,7 @@ from eval.modes.figures import maze_figure, since_figure
 from eval.worlds import runs
 from eval.worlds.labyrinth import DATA, data_digest
 from neuroprior import read_plans
+from neuroprior._folders import claim_out
 from neuroprior._jobs import JobRun
 from neuroprior.behaviour.analysis.modes import STABLE, mode_table
 from neuroprior.behaviour.reporting.document import Column, Document, publish, table, write_figures
@@ -33,6 +34,7 @@ from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
 from neuroprior.behaviour.reporting.scores import load_arrays, save_arrays
 
 
+@claim_out
 def modes(
     modes: Sequence[PositiveInt] = (1, 2, 3),
     orders: Sequence[NonNegativeInt] = (1, 2),

@@ -11,6 +11,7 @@ from eval.options.run import LABYRINTH, OptionSettings, options_run
 from eval.worlds import runs
 from eval.worlds.labyrinth import check_fits
 from eval.worlds.suite import TASKS
+from neuroprior._folders import claim_out
 from neuroprior.behaviour.reporting.document import write_figures
 
 WORLDS = (LABYRINTH, "four_rooms", "goal_maze")
@@ -22,6 +23,7 @@ OFFERED = (LABYRINTH, *(name for name, task in TASKS.items() if task.feature_set
 OptionWorld: TypeAlias = Literal[OFFERED]  # type: ignore[valid-type]
 
 
+@claim_out
 def options(
     worlds: Sequence[OptionWorld] = WORLDS,
     seeds: PositiveInt = 5,

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from neuroprior._files import written_whole
+from neuroprior._folders import claim_out
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -32,6 +33,7 @@ HOURS = {
 """By page: the hours that it states, on one or two cores; + where it states them for some of its commands only."""
 
 
+@claim_out
 def pages(stages: Sequence[str] = tuple(HOURS), listing: bool = False, out: str = "runs/results") -> None:
     """Run what the pages of results show, page by page; what each command prints is kept in a file.
 
@@ -86,7 +88,6 @@ def perform(steps: Mapping[str, Sequence[str]], folder: Path) -> None:
         ValueError: a command failed.
     """
     programs = {"python": [sys.executable], "neuroprior": [sys.executable, "-m", "neuroprior"]}
-    folder.mkdir(parents=True, exist_ok=True)
     for name, words in steps.items():
         file = folder / f"{name}.txt"
         if is_done(file, words):

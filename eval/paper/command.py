@@ -13,15 +13,25 @@ from eval.paper import figures, first_simulation, second_simulation, value_quali
 from eval.paper.first_simulation import PAPER_BEST, PAPER_MATRIX, PROTOCOLS
 from eval.paper.planners import ANY_PREFIX, PaperSettings, under_each
 from eval.paper.second_simulation import PAPER_REACHED, SCALES
-from neuroprior._files import versions, write_json
+from neuroprior._files import versions
+from neuroprior._folders import claim_out
 from neuroprior._jobs import Progress
-from neuroprior.behaviour.reporting.document import Column, printed, records, table, write_figures, write_frames
+from neuroprior.behaviour.reporting.document import (
+    Column,
+    printed,
+    records,
+    table,
+    write_figures,
+    write_frames,
+    write_results,
+)
 
 SHORT = {"deterministic": "det.", "random": "rand.", "markov-1": "m-1", "markov-2": "m-2", "markov-3": "m-3"}
 SHORT |= {"transformer": "trans."}
 """Names of planners in headings."""
 
 
+@claim_out
 def paper(
     worlds: PositiveInt = 100,
     starts: PositiveInt = 1000,
@@ -81,11 +91,10 @@ def paper(
             raise ValueError(f"`{name}` must be an integer of at least 2, got {settings[name]}")
     own = PaperSettings(**{name: value for name, value in settings.items() if name not in ("protocols", "out")})
     folder, console = Path(out), Console()
-    folder.mkdir(parents=True, exist_ok=True)
     results = {"settings": settings, "versions": versions(), "seed": seed}
     for part in (_all_settings,) if protocols == "all" else (_first, _second):
         results |= part(own, console, folder)
-        write_json(folder / "results.json", results)  # an error in the second part does not lose the first
+        write_results(folder, results)  # an error in the second part does not lose the first
     console.print(f"written to {folder}")
 
 

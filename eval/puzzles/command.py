@@ -28,6 +28,7 @@ from eval.puzzles.contest import (
 )
 from eval.worlds.runs import check_distinct, command_line
 from neuroprior._files import write_whole
+from neuroprior._folders import claim, claim_out
 from neuroprior._jobs import JobRun
 from neuroprior._statistics import paired_difference
 from neuroprior.behaviour.reporting.document import Document, publish, table
@@ -44,6 +45,7 @@ FILES = {
 PriorName = Literal[BOOTSTRAP, REROOTED, *PLANNERS, *SEARCHES]  # type: ignore[valid-type]
 
 
+@claim_out
 def puzzles(
     world: WorldName = "sokoban",
     train: str | None = None,
@@ -244,6 +246,8 @@ def _write_solutions(found: Sequence[dict[str, Any]], test: Problems, out: Path)
         for one in found
         for k, (moves, expansions) in enumerate(zip(one["moves"], one["expansions"], strict=True))
     ]  # fmt: skip
+    with claim(out) as place:
+        place.add(["solutions.jsonl", "solution.svg"])
     write_whole(out / "solutions.jsonl", ("\n".join(lines) + "\n").encode())
     solved = [(len(moves), k) for k, moves in enumerate(found[0]["moves"]) if moves]
     if solved:

@@ -17,6 +17,7 @@ from torch import Tensor
 from eval.quality.sequences import CONDITIONS, Sequences, sequences
 from eval.worlds.runs import Seed, plus_minus
 from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, Prior, TransformerPrior, fit
+from neuroprior._folders import claim_out
 from neuroprior._jobs import JobRun, Progress
 from neuroprior._random import draw_seed
 from neuroprior._statistics import paired_difference
@@ -135,6 +136,7 @@ def sources(generator: torch.Generator) -> list[Source]:
     ]
 
 
+@claim_out
 def quality(
     num_plans: NonNegativeInt = 100_000,
     held_out: PositiveInt = 5_000,

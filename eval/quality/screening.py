@@ -17,6 +17,7 @@ from eval.quality.sequences import sequences
 from eval.worlds.labyrinth import DATA
 from eval.worlds.runs import Seed
 from neuroprior import Plans, read_plans
+from neuroprior._folders import claim_out
 from neuroprior._jobs import JobRun
 from neuroprior.behaviour import read
 from neuroprior.behaviour.reporting.document import Column, Document, publish, table
@@ -52,6 +53,7 @@ class Job:
         return f"{self.data.replace(' / ', '-x').replace(' ', '-').replace(',', '')}-{self.seed}"
 
 
+@claim_out
 def screening(
     sizes: list[PositiveInt] = [300, 3000, 30_000],  # noqa: B006
     num_sequences: NonNegativeInt = 40,

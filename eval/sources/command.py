@@ -9,12 +9,14 @@ from jsonargparse.typing import PositiveInt
 from eval.sources.report import sources_document
 from eval.sources.run import SOURCES, WORLDS, SourceSettings, run_sources
 from eval.worlds import runs
+from neuroprior._folders import claim_out
 from neuroprior.behaviour.reporting.document import write_figures
 from neuroprior.comparison.trial import MIN_LEARNED
 
 SourceWorld: TypeAlias = Literal[tuple(WORLDS)]  # type: ignore[valid-type]
 
 
+@claim_out
 def sources(
     worlds: Sequence[SourceWorld] = tuple(WORLDS),
     plans: Sequence[PositiveInt] = (20, 100, 500),

@@ -10,6 +10,7 @@ import pandas as pd
 import torch
 from jsonargparse.typing import NonNegativeInt, PositiveInt
 
+from neuroprior._folders import claim_out
 from neuroprior._jobs import JobRun
 from neuroprior._statistics import LEVEL
 from neuroprior.behaviour import (
@@ -231,6 +232,7 @@ def _least(values: torch.Tensor) -> float:
     return float(known.min()) if len(known) else np.nan
 
 
+@claim_out
 def calibration(
     studies: PositiveInt = 1000,
     permutations: PositiveInt = 199,

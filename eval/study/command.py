@@ -13,6 +13,7 @@ from scipy import stats
 
 from eval.study import time_tests
 from eval.study.time_tests import recordings_of
+from neuroprior._folders import claim_out
 from neuroprior._jobs import JobRun
 from neuroprior.behaviour import compare_conditions, share_interval, simulated_study
 from neuroprior.behaviour.reporting.document import Document, publish, table
@@ -56,6 +57,7 @@ class Batch:
         return f"{'effect' if self.effect else 'none'}-{name}-{self.number}"
 
 
+@claim_out
 def study(
     studies: NonNegativeInt = 1000,
     with_effect: PositiveInt = 200,

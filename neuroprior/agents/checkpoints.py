@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,11 @@ from safetensors.torch import save as write_tensors
 from torch import Tensor
 
 from neuroprior._files import read_json, write_whole
+from neuroprior._folders import claim
 from neuroprior.agents.agent import Agent, Steps
 from neuroprior.planners import Decision
 from neuroprior.plans import Plans
-from neuroprior.priors import serialization
+from neuroprior.priors import Prior, serialization
 
 FORMAT, VERSION = "neuroprior agent", 2
 
@@ -26,7 +28,7 @@ def save_agent(agent: Agent, folder: str | os.PathLike[str]) -> Path:
     """Save an agent to a folder, made if need be: its state, replay, prior and random generator.
 
     Files are named by a hash of their content, and `agent.json`, which lists them, is written last: the folder holds
-    the last complete checkpoint at all times. The files of the checkpoint before are then removed, and nothing else.
+    the last complete checkpoint at all times. The files of checkpoints before are then removed, and nothing else.
     World and planner are not saved.
 
     Args:
@@ -47,27 +49,24 @@ def save_agent(agent: Agent, folder: str | os.PathLike[str]) -> Path:
         >>> folder = save_agent(agent, "runs/agent")
     """
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    before = _read(folder / "agent.json") if (folder / "agent.json").exists() else {}
-    partial = serialization.save(agent.prior, folder / f".prior.{os.getpid()}.partial")
-    of_prior = _digest(partial)
-    prior = f"prior-{of_prior[:16]}"
-    if (folder / prior).exists():  # the same, saved before
-        shutil.rmtree(partial)
-    else:
-        partial.rename(folder / prior)
+    of_prior = serialization.model_bytes(agent.prior)
     data = write_tensors({name: value.detach().cpu().contiguous().clone() for name, value in _tensors(agent).items()})
-    digest = hashlib.sha256(data).hexdigest()
-    weights = f"agent-{digest[:16]}.safetensors"
-    write_whole(folder / weights, data)
+    digests = [hashlib.sha256(content).hexdigest() for content in (of_prior, data)]
+    prior, weights = f"prior-{digests[0][:16]}", f"agent-{digests[1][:16]}.safetensors"
     document = {"format": FORMAT, "version": VERSION, "time": agent.time, "agent": _settings(agent)}
-    document |= {"prior": prior, "prior_sha256": of_prior, "weights": weights, "sha256": digest}
+    document |= {"prior": prior, "prior_sha256": digests[0], "weights": weights, "sha256": digests[1]}
     document |= {"recent": len(agent.recent)}
-    write_whole(folder / "agent.json", (json.dumps(document, indent=2) + "\n").encode())
-    if before and before["weights"] != weights:
-        (folder / before["weights"]).unlink(missing_ok=True)
-    if before and before["prior"] != prior:
-        shutil.rmtree(folder / before["prior"], ignore_errors=True)
+    with claim(folder, name="folder", seconds=serialization.SECONDS):
+        if (folder / "agent.json").exists():
+            _read(folder / "agent.json")
+        serialization.write_model(of_prior, folder / prior)
+        write_whole(folder / weights, data)
+        write_whole(folder / "agent.json", (json.dumps(document, indent=2) + "\n").encode())
+        for path in folder.iterdir():  # also what a process that was killed left there
+            if re.fullmatch(r"agent-[0-9a-f]{16}\.safetensors", path.name) and path.name != weights:
+                path.unlink()
+            elif re.fullmatch(r"prior-[0-9a-f]{16}", path.name) and path.name != prior:
+                shutil.rmtree(path, ignore_errors=True)
     return folder
 
 
@@ -91,7 +90,7 @@ def restore_agent(agent: Agent, folder: str | os.PathLike[str]) -> Agent:
         >>> again = restore_agent(agent, folder)
     """
     folder = Path(folder)
-    document = _read(folder / "agent.json")
+    document, data, prior = _read_files(folder, agent.prior.device)
     own, saved = _settings(agent), document["agent"]
     saved = saved | {"training": saved.get("training") or {}}  # was None for some priors
     saved = saved | {"config": _as_described_now(saved["config"], own["config"])}
@@ -99,27 +98,38 @@ def restore_agent(agent: Agent, folder: str | os.PathLike[str]) -> Agent:
         other = [name for name, value in own.items() if saved.get(name) != value]
         raise ValueError(f"{folder}: of an agent with other {', '.join(other)}; give this one the same")
     path = folder / document["weights"]
-    data = path.read_bytes()
-    if (
-        hashlib.sha256(data).hexdigest() != document["sha256"]
-        or _digest(folder / document["prior"]) != document["prior_sha256"]
-    ):
-        raise ValueError(
-            f"{folder}: {path.name} or {document['prior']} is truncated, changed, or of another checkpoint"
-        )
     try:
         tensors = read_tensors(data)
     except SafetensorError as error:
         raise ValueError(f"{path}: not a file of tensors ({error})") from error
     if sum(name.startswith("recent.") for name in tensors) != len(Steps._fields) * document["recent"]:
         raise ValueError(f"{folder / 'agent.json'}: 'recent' does not fit {path.name}")
-    prior = serialization.load(folder / document["prior"], agent.prior.device)
     agent.world.check_state(tensors["state"].to(agent.state.device))
     agent.prior.restore(prior.learned)
     agent.prior.load_state_dict(prior.state_dict())
     agent.time = document["time"]
     _take(agent, tensors, document["recent"])
     return agent
+
+
+def _read_files(folder: Path, device: torch.device) -> tuple[dict[str, Any], bytes, Prior]:
+    """What `agent.json` holds, the file of the agent's tensors, and its prior; of one checkpoint.
+
+    A checkpoint that is saved meanwhile takes the files of the one before away; then it is read.
+    """
+    document = _read(folder / "agent.json")
+    try:
+        data, prior = (folder / document["weights"]).read_bytes(), folder / document["prior"]
+        digests = [hashlib.sha256(one).hexdigest() for one in (data, (prior / serialization.MODEL).read_bytes())]
+        if digests != [document["sha256"], document["prior_sha256"]]:
+            raise ValueError(
+                f"{folder}: {document['weights']} or {prior.name} is truncated, changed, or of another checkpoint"
+            )
+        return document, data, serialization.load(prior, device)
+    except FileNotFoundError:
+        if _read(folder / "agent.json") == document:
+            raise
+        return _read_files(folder, device)
 
 
 def _as_described_now(saved: Any, own: Any) -> Any:
@@ -131,11 +141,6 @@ def _as_described_now(saved: Any, own: Any) -> Any:
     chosen = {name: value for name, value in own.items() if name == "seed" or value is None}
     same = {name: _as_described_now(value, own[name]) if name in own else value for name, value in saved.items()}
     return same | chosen if "seed" in own and "seed" not in saved else same
-
-
-def _digest(prior: Path) -> str:
-    """A hash of both files of a saved prior."""
-    return hashlib.sha256(b"".join((prior / name).read_bytes() for name in serialization.FILES)).hexdigest()
 
 
 def _settings(agent: Agent) -> dict[str, Any]:

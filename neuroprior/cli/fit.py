@@ -1,7 +1,6 @@
 """`neuroprior fit`: trains a prior on executed plans, saves it, and compares it with baselines."""
 
 from collections.abc import Callable
-from contextlib import suppress
 from copy import deepcopy
 from dataclasses import fields, replace
 from functools import partial
@@ -16,6 +15,7 @@ from jsonargparse.typing import NonNegativeInt, PositiveInt
 from rich.console import Console
 
 from neuroprior._files import write_whole
+from neuroprior._folders import LOCK, claim
 from neuroprior.behaviour.analysis.comparison import best_chain
 from neuroprior.behaviour.analysis.modes import choose_modes
 from neuroprior.behaviour.recorded_plans import RecordedPlans
@@ -35,6 +35,7 @@ from neuroprior.priors.fitting import PRIORS, make_prior
 from neuroprior.priors.learning import plans_for
 from neuroprior.priors.neural import NeuralPrior
 from neuroprior.priors.saved import SavedModule
+from neuroprior.priors.scoring import is_learned
 from neuroprior.training import Settings, train
 from neuroprior.worlds import World
 
@@ -86,6 +87,8 @@ def run(arguments: list[str]) -> None:
             raise ValueError("`resume` must be given alone: a run goes on with its own options.")
         if not (Path(folder) / OPTIONS).is_file():
             raise ValueError(f"`resume` must be the folder of a run, which holds {OPTIONS}, got {folder}.")
+        if not (Path(folder) / PLANS).is_file():
+            raise ValueError(f"`resume` must be a run that has kept its {PLANS}, got {folder}; give its command again.")
         given = parser.parse_args(["--config", str(Path(folder) / OPTIONS), "--resume", folder])
     options, made = parser.dump(given), parser.instantiate(given).as_dict()
     del made["config"]
@@ -165,67 +168,67 @@ def fit(
         reading: how files are read.
     """
     folder, generator = Path(resume or out), torch.Generator().manual_seed(seed)
-    if resume is None and folder.exists() and any(folder.iterdir()):
-        raise ValueError(f"`out` must be a new or empty folder, got {out}; --resume {out} goes on with a run there.")
-    if resume is not None:
-        source = read_npz(folder / PLANS, None, None, RecordedPlans)
-    elif plans:
-        source = reading.read(plans)
-    elif world is not None and planner is not None:
-        source = RecordedPlans.of(collect(planner, world, num_plans, context=context, generator=generator))
-    else:
-        raise ValueError(f"`plans` must be a file, or give --config and a recipe: {', '.join(recipes())}.")
-    ended = source.with_end() if end and source.end is None else source
-    parts = divide(ended, validation, held_out, folds, past_durations, seed)
-    training = replace(training, validation=validation)
-    arguments: dict[str, Any] = {} if effort is None else {"effort": effort}
-    try:
-        made = make_prior(parts.plans, partial(prior, **arguments), use_context)
-    except TypeError as error:
-        if "'effort'" in str(error):
-            raise ValueError(
-                f"`effort` must be left out for another prior than the combined one, got {effort}."
-            ) from error
-        raise ValueError(
-            f"`prior` must take what it is given: {error}; --use_context false leaves the context out."
-        ) from error
-    frames = {}
-    if modes is not None:
-        made, frames["modes"] = _choose_modes(made, modes, parts)
-    if orders is not None:
-        made, frames["orders"] = _choose_order(made, orders, parts)
-    if made.fit_settings and torch.cuda.is_available():
-        made.cuda()
-    fresh = deepcopy(made)
-    if isinstance(made, NeuralPrior):
-        made.prepare(parts.learned_from, training.window)
-    folder.mkdir(parents=True, exist_ok=True)
-    if resume is None:
-        write_plans(source, folder / PLANS)
-        write_whole(folder / OPTIONS, options.encode())
-    write_frames(folder, frames)
-    for note in source.notes:
-        print(f"note: {note}")
-    # Defaults are left to the prior, as in `neuroprior.fit`: those of the networks inside it may be others.
-    changed = {name: value for name, value in vars(training).items() if value != getattr(DEFAULTS, name)}
-    settings = {name: changed[name] for name in made.fit_settings if name in changed}
-    curve: list[dict[str, float]] = []
-    try:
-        if isinstance(made, NeuralPrior):
-            how = replace(training, validation=parts.chosen_on)
-            curve = train(made, parts.learned_from, how, seed, folder)
-        elif (saved := _saved(folder)) is not None:
-            made = saved
+    with claim(folder, owns_all=True, name="out" if resume is None else "resume"):
+        if resume is None:
+            _check_new(folder, options)
+        if resume is not None:
+            source = read_npz(folder / PLANS, None, None, RecordedPlans)
+        elif plans:
+            source = reading.read(plans)
+        elif world is not None and planner is not None:
+            source = RecordedPlans.of(collect(planner, world, num_plans, context=context, generator=generator))
         else:
-            learned_from = parts.plans if parts.folds > 1 else parts.learned_from
-            made.fit(learned_from, generator=torch.Generator().manual_seed(seed), **settings)
-        if isinstance(made, CombinedPrior) and isinstance(fresh, CombinedPrior):
-            fresh.networks = made.trained  # those that did not pay are not tried again in each fold
-        if "progress" in made.fit_settings:
-            settings["progress"] = False  # of several processes, which would get mixed
-        report(folder, made, curve, parts, fresh, settings)
-    except KeyboardInterrupt as interrupted:
-        raise KeyboardInterrupt(f"interrupted; go on with: neuroprior fit --resume {folder}") from interrupted
+            raise ValueError(f"`plans` must be a file, or give --config and a recipe: {', '.join(recipes())}.")
+        ended = source.with_end() if end and source.end is None else source
+        parts = divide(ended, validation, held_out, folds, past_durations, seed)
+        training = replace(training, validation=validation)
+        arguments: dict[str, Any] = {} if effort is None else {"effort": effort}
+        try:
+            made = make_prior(parts.plans, partial(prior, **arguments), use_context)
+        except TypeError as error:
+            if "'effort'" in str(error):
+                raise ValueError(
+                    f"`effort` must be left out for another prior than the combined one, got {effort}."
+                ) from error
+            raise ValueError(
+                f"`prior` must take what it is given: {error}; --use_context false leaves the context out."
+            ) from error
+        frames = {}
+        if modes is not None:
+            made, frames["modes"] = _choose_modes(made, modes, parts)
+        if orders is not None:
+            made, frames["orders"] = _choose_order(made, orders, parts)
+        if made.fit_settings and torch.cuda.is_available():
+            made.cuda()
+        fresh = deepcopy(made)
+        if isinstance(made, NeuralPrior):
+            made.prepare(parts.learned_from, training.window)
+        if resume is None:
+            write_whole(folder / OPTIONS, options.encode())  # first: it says whose folder it is
+            write_plans(source, folder / PLANS)
+        write_frames(folder, frames)
+        for note in source.notes:
+            print(f"note: {note}")
+        # Defaults are left to the prior, as in `neuroprior.fit`: those of the networks inside it may be others.
+        changed = {name: value for name, value in vars(training).items() if value != getattr(DEFAULTS, name)}
+        settings = {name: changed[name] for name in made.fit_settings if name in changed}
+        curve: list[dict[str, float]] = []
+        try:
+            if isinstance(made, NeuralPrior):
+                how = replace(training, validation=parts.chosen_on)
+                curve = train(made, parts.learned_from, how, seed, folder)
+            elif is_learned(folder):
+                made = load(folder)
+            else:
+                learned_from = parts.plans if parts.folds > 1 else parts.learned_from
+                made.fit(learned_from, generator=torch.Generator().manual_seed(seed), **settings)
+            if isinstance(made, CombinedPrior) and isinstance(fresh, CombinedPrior):
+                fresh.networks = made.trained  # those that did not pay are not tried again in each fold
+            if "progress" in made.fit_settings:
+                settings["progress"] = False  # of several processes, which would get mixed
+            report(folder, made, curve, parts, fresh, settings)
+        except KeyboardInterrupt as interrupted:
+            raise KeyboardInterrupt(f"interrupted; go on with: neuroprior fit --resume {folder}") from interrupted
 
 
 def _choose_modes(prior: Prior, modes: list[int], parts: Parts) -> tuple[Prior, Any]:
@@ -270,8 +273,11 @@ def _choose_order(prior: Prior, orders: list[int], parts: Parts) -> tuple[Prior,
     return MarkovPrior(**prior.config | chosen), frame
 
 
-def _saved(folder: Path) -> Prior | None:
-    """The prior that a run had saved when it was interrupted; None where it learns anew."""
-    with suppress(ValueError, OSError):
-        return load(folder)
-    return None
+def _check_new(folder: Path, options: str) -> None:
+    """Raise ValueError unless a folder is empty, or was when a run with these options was killed at its beginning."""
+    there = {path.name for path in folder.iterdir()} - {LOCK}
+    if there == {OPTIONS} and (folder / OPTIONS).read_bytes() == options.encode():
+        return
+    if there:
+        goes_on = f"; --resume {folder} goes on with the run there" if {OPTIONS, PLANS} <= there else ""
+        raise ValueError(f"`out` must be a new or empty folder, got {folder}{goes_on}.")

@@ -14,9 +14,10 @@ from neuroprior.behaviour.analysis.comparison import Score, baselines, never_tak
 from neuroprior.behaviour.reporting.document import printed, records, table, write_figures, write_frames
 from neuroprior.cli.fit_data import Parts
 from neuroprior.cli.fit_folds import TRAINED, cross_validated
-from neuroprior.priors import CombinedPrior, Prior, save
+from neuroprior.priors import CombinedPrior, Prior
 from neuroprior.priors.fitting import name_of
 from neuroprior.priors.scoring import keep_learned
+from neuroprior.priors.serialization import model_bytes, write_model
 
 
 def report(
@@ -42,11 +43,13 @@ def report(
     """
     console = Console(markup=False)
     prior, name = prior.cpu().eval(), name_of(prior)
-    save(prior, folder)
+    model, parts = model_bytes(prior), (data.learned_from, data.chosen_on)
+    many = data.folds > 1
+    held_out = None if many else data.held_out
+    keep_learned(folder, *parts, model=model, held_out=held_out, plans=data.plans)
     if data.past_durations is not None and prior.takes_context:
         data.past_durations.save(folder)
-    many = data.folds > 1
-    keep_learned(folder, data.learned_from, data.chosen_on, held_out=None if many else data.held_out, plans=data.plans)
+    write_model(model, folder)  # last: it is the run's own if this is kept beside it
     contexts = data.num_contexts if prior.takes_context else None
     scores: dict[str, Score] = {}
     if many:
@@ -72,9 +75,9 @@ def report(
     frame = pd.DataFrame([*rows, last], columns=list(last))
     best = frame.iloc[int(frame.validation_bits.astype(float).argmin())]
     console.print(_table(frame, best.model, data))
-    parts = {"training": data.learned_from, "validation": data.chosen_on, "held_out": data.held_out}
+    divided = {"training": data.learned_from, "validation": data.chosen_on, "held_out": data.held_out}
     results = {"rows": records(frame), "chosen": best.model, "unit": unit_name(data.held_out), "folds": data.folds}
-    results |= {"plans": {part: len(plans) for part, plans in parts.items()}, "curve": curve}
+    results |= {"plans": {part: len(plans) for part, plans in divided.items()}, "curve": curve}
     write_json(folder / "metrics.json", results | {"versions": versions()})
     write_frames(folder, {"metrics": frame})
     if curve:

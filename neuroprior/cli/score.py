@@ -1,12 +1,11 @@
 """`neuroprior score`: how probable plans are under a saved prior."""
 
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-import pandas as pd
 from rich.console import Console
 
+from neuroprior._folders import claim, claim_out
 from neuroprior.behaviour.analysis.comparison import action_bits, score_bits, too_few, unit_name
 from neuroprior.behaviour.durations.past_durations import PastDurations
 from neuroprior.behaviour.reporting.document import printed, table, write_frames
@@ -22,6 +21,7 @@ MOST_ROWS = 20
 """Rows that are printed; the CSV files have all."""
 
 
+@claim_out
 def score(
     folder: str,
     files: list[str],
@@ -49,9 +49,8 @@ def score(
     own, past = match_plans(plans, prior, folder), PastDurations.load(Path(folder))
     own = own if past is None else past.added_to(own)
     units = [by for by in UNITS if by == "plan" or getattr(plans, by) is not None]
-    for path in (place / f"{by}s.csv" for by in units):
-        if path.exists() and not _is_of_scores(path):
-            raise ValueError(f"out: {path} is there, and holds no scores; give another folder")
+    with claim(place) as claimed:
+        claimed.check(f"{by}s.csv" for by in units)
     bits = action_bits(prior, own)
     whole = score_bits(folder, "", bits, own).bits_per_action()
     learned = learned_from(Path(folder), plans)
@@ -76,7 +75,6 @@ def score(
         notes.append(f"{numbered_note('actions', plans.action_names)}; --action_names orders them")
     if plans.action_names is None and known is not None:
         notes.append(taken_note("actions", known))
-    place.mkdir(parents=True, exist_ok=True)
     console = Console(markup=False)
     for note in notes:
         console.print(f"note: {note}", highlight=False, soft_wrap=True)
@@ -86,15 +84,7 @@ def score(
     interval = f"95 % interval {whole.low:.4f} to {whole.high:.4f} over {unit_name(plans)}"
     few = too_few(plans)
     console.print(f"{whole.mean:.4f} bits per action, {interval}{few and f'; {few}'}", highlight=False)
-    earlier = [f"{by}s" for by in UNITS if f"{by}s" not in frames and _is_of_scores(place / f"{by}s.csv")]
-    write_frames(place, dict.fromkeys(earlier, pd.DataFrame()) | frames)
+    write_frames(place, frames)
     console.print(
         f"tables: {', '.join(str(place / f'{name}.csv') for name in frames)}", highlight=False, soft_wrap=True
     )
-
-
-def _is_of_scores(file: Path) -> bool:
-    """Whether a file is one of the tables that `score` writes."""
-    with suppress(OSError, ValueError), file.open(encoding="utf-8") as lines:
-        return {"log_likelihood", "bits_per_action"} <= {*lines.readline().strip().split(",")}
-    return False

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from neuroprior._files import versions, write_json, written_whole
+from neuroprior._folders import claim
 from neuroprior._statistics import ENOUGH_UNITS, Difference, holm, ratio_difference
 from neuroprior.comparison.contestants import BASELINE
 from neuroprior.comparison.trial import TOLERANCE, Array, Outcome
@@ -185,11 +186,6 @@ class Comparison:
             OSError: a file cannot be written.
         """
         frame, figure, folder = self.frame(), self.figure(), Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        with written_whole(folder / "comparison.csv") as file:
-            frame.to_csv(file, index=False)
-        with written_whole(folder / "comparison.png", "wb") as file:
-            figure.savefig(file, format="png", dpi=150)
         seeds = [
             {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in one._asdict().items()}
             for one in self.outcomes
@@ -207,7 +203,13 @@ class Comparison:
             "seeds": seeds,
             "versions": versions(),
         }
-        write_json(folder / "comparison.json", content)
+        with claim(folder, replaces=True) as place:
+            place.add([f"comparison.{ending}" for ending in ("csv", "png", "json")])
+            with written_whole(folder / "comparison.csv") as file:
+                frame.to_csv(file, index=False)
+            with written_whole(folder / "comparison.png", "wb") as file:
+                figure.savefig(file, format="png", dpi=150)
+            write_json(folder / "comparison.json", content)
 
     def summary(self) -> str:
         """Say in a sentence for each planner whether a prior helps it.

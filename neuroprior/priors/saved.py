@@ -20,6 +20,9 @@ class SavedModule(nn.Module, ABC):
     tables: tuple[str, ...] = ()
     """Buffers whose sizes depend on what was learned, so that they are taken from the file."""
 
+    log_tables: tuple[str, ...] = ()
+    """Buffers of log-probabilities, which may be -inf; everything else is finite."""
+
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         SavedModule.known.add(cls.__name__, cls)

@@ -16,7 +16,7 @@ from neuroprior._files import read_json, write_json
 from neuroprior.plans import Plans
 from neuroprior.priors.matching import match_plans
 from neuroprior.priors.prior import Prior
-from neuroprior.priors.serialization import load
+from neuroprior.priors.serialization import MODEL, digest, load
 
 LEARNED = "learned.json"
 """In the folder of a saved prior: the digests of the plans that it has learned from, at least in part."""
@@ -121,19 +121,32 @@ def plan_digests(plans: Plans) -> list[str]:
     return [hashlib.sha256(text.encode()).hexdigest()[:16] for text in texts]
 
 
-def keep_learned(folder: Path, *parts: Plans, held_out: Plans | None = None, plans: Plans | None = None) -> None:
+def keep_learned(
+    folder: Path, *parts: Plans, model: bytes | None = None, held_out: Plans | None = None, plans: Plans | None = None
+) -> None:
     """Write down, in the folder of a saved prior, which plans it has learned from.
 
     Args:
         folder: of the prior.
         parts: what it has learned from.
+        model: its file, which is written to the folder next; None: the one that is there.
         held_out: what it has not learned from.
         plans: those that all this was taken from; of a plan that was cut, and so is in no part, a part was learned.
     """
     learned = {one for part in parts for one in plan_digests(part)}
     if plans is not None:
         learned |= {*plan_digests(plans)} - {*(() if held_out is None else plan_digests(held_out))}
-    write_json(folder / LEARNED, {"plans": sorted(learned)})
+    model = (folder / MODEL).read_bytes() if model is None else model
+    write_json(folder / LEARNED, {"model": digest(model), "plans": sorted(learned)})
+
+
+def is_learned(folder: Path) -> bool:
+    """Whether the prior in a folder is that of `keep_learned`; else there is none, or another one was saved there.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    return _read_learned(folder) is not None
 
 
 def learned_from(folder: Path, plans: Plans) -> list[bool]:
@@ -144,12 +157,20 @@ def learned_from(folder: Path, plans: Plans) -> list[bool]:
     Raises:
         ValueError: the file is damaged.
     """
+    return are_among(plans, _read_learned(folder) or set())
+
+
+def _read_learned(folder: Path) -> set[str] | None:
+    """The digests of the plans that the prior in a folder has learned from; None where they are not known."""
     place = folder / LEARNED
-    content = read_json(place) if place.is_file() else {"plans": []}
+    if not place.is_file():
+        return None
+    content = read_json(place)
     known = content.get("plans") if isinstance(content, dict) else None
     if not isinstance(known, list) or not all(isinstance(one, str) for one in known):
         raise ValueError(f"{place}: damaged; it does not say which plans were learned from")
-    return are_among(plans, set(known))
+    model = folder / MODEL
+    return set(known) if model.is_file() and digest(model.read_bytes()) == content.get("model") else None
 
 
 def are_among(plans: Plans, known: set[str], least: int = 1) -> list[bool]:

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from hashlib import sha256
 from os import PathLike
 from pathlib import Path
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_flags, check_sizes, kind_of
 from neuroprior._files import read_json, write_json, written_whole
+from neuroprior._folders import claim
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.plans.sequences import Sequences, plans_digest
@@ -147,29 +149,30 @@ def bootstrap(
             if name != "progress"
         },
     }
-    run = _Bootstrap(world, prior, problems, asked, None if folder is None else Path(folder), generator, sweeps)
-    yield from run.done
-    while len(run.done) < sweeps:
-        tried, budget = run.next()
-        with_teacher = teacher is not None and not run.done
-        heuristic = world.lower_bound if guided else None  # type: ignore[attr-defined]
-        planner = teacher if with_teacher else LevinPlanner(prior, budget, heuristic=heuristic)
-        assert planner is not None
-        begin = time.perf_counter()
-        found = planner.search(world, problems[:tried])
-        run.take(found)
-        searched = time.perf_counter()
-        actions = run.learn(max_actions, settings)
-        seconds = searched - begin, time.perf_counter() - searched
-        share, mean = float(found.solved.double().mean()), float(found.expansions.double().mean())
-        run.end(Sweep(len(run.done) + 1, tried, planner.max_nodes, share, len(run.plans), mean, actions, *seconds))
-        yield run.done[-1]
-    if not run.plans:
-        last = run.done[-1]
-        raise ValueError(
-            f"`max_nodes` must be enough to solve some of {last.problems} problems, got none that {last.max_nodes}"
-            " expansions solve. Give a larger max_nodes, more sweeps, a teacher or easier problems."
-        )
+    with nullcontext() if folder is None else claim(Path(folder), name="folder"):
+        run = _Bootstrap(world, prior, problems, asked, None if folder is None else Path(folder), generator, sweeps)
+        yield from run.done
+        while len(run.done) < sweeps:
+            tried, budget = run.next()
+            with_teacher = teacher is not None and not run.done
+            heuristic = world.lower_bound if guided else None  # type: ignore[attr-defined]
+            planner = teacher if with_teacher else LevinPlanner(prior, budget, heuristic=heuristic)
+            assert planner is not None
+            begin = time.perf_counter()
+            found = planner.search(world, problems[:tried])
+            run.take(found)
+            searched = time.perf_counter()
+            actions = run.learn(max_actions, settings)
+            seconds = searched - begin, time.perf_counter() - searched
+            share, mean = float(found.solved.double().mean()), float(found.expansions.double().mean())
+            run.end(Sweep(len(run.done) + 1, tried, planner.max_nodes, share, len(run.plans), mean, actions, *seconds))
+            yield run.done[-1]
+        if not run.plans:
+            last = run.done[-1]
+            raise ValueError(
+                f"`max_nodes` must be enough to solve some of {last.problems} problems, got none that {last.max_nodes}"
+                " expansions solve. Give a larger max_nodes, more sweeps, a teacher or easier problems."
+            )
 
 
 def _describe(teacher: BestFirstPlanner) -> dict[str, Any]:
@@ -242,7 +245,6 @@ class _Bootstrap:
         self.done.append(sweep)
         if self.folder is None:
             return
-        self.folder.mkdir(parents=True, exist_ok=True)
         save(self.prior, self.folder / f"prior-{sweep.number}")
         plans = {str(number): plan for number, plan in self.plans.items()}
         with written_whole(self.folder / f"solutions-{sweep.number}.safetensors", "wb") as file:

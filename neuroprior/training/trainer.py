@@ -19,6 +19,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
+from neuroprior._files import replacing
 from neuroprior._threads import one_thread
 from neuroprior.plans.folds import check_alike, fair_split
 from neuroprior.plans.sequences import Sequences
@@ -203,9 +204,8 @@ class Keeper(WeightAveraging):
             steps = f"step {trainer.global_step:,} of at most {self.max_steps:,}"
             print(f"training: {steps}, {bits:.4f} validation bits", file=sys.stderr, flush=True)
         if self.folder is not None:
-            partial = self.folder / f".{LAST}.partial"
-            trainer.save_checkpoint(partial)
-            partial.replace(self.folder / LAST)  # whole or not at all, whenever the process is killed
+            with replacing(self.folder / LAST) as partial:
+                trainer.save_checkpoint(partial)
 
     def state_dict(self) -> dict[str, Any]:
         kept = {name: getattr(self, name) for name in KEPT}

@@ -52,17 +52,17 @@ def test_tables_of_an_earlier_file_go_and_those_of_others_stay(tmp_path):
     """Nor are they written over, not even those that are scored: plans.csv is a good name for plans, too."""
     _, frames = scored(tmp_path, drawn(9, group=torch.arange(9) % 3, condition=torch.arange(9) % 3))
     assert set(frames) == {"plans", "groups", "conditions"}
-    (tmp_path / "out" / "groups.csv").write_text("group,weight\na,1\n")
     _, frames = scored(tmp_path, drawn(9))
-    assert set(frames) == {"plans", "groups"}
-    with refuses("groups.csv is there"):
+    assert set(frames) == {"plans"}
+    (tmp_path / "out" / "groups.csv").write_text("group,weight\na,1\n")
+    with refuses("`out` must be a folder without groups.csv"):
         scored(tmp_path, drawn(9, group=torch.arange(9) % 3))
     plans = tmp_path / "data" / "plans.csv"
     plans.parent.mkdir()
     # A report's own table of that name has bits per action, too.
     for content in ("plan,action\n0,1\n0,2\n", "model,bits_per_action\nmine,1\n"):
         plans.write_text(content)
-        with refuses("out: ", "plans.csv is there, and holds no scores; give another folder"):
+        with refuses("`out` must be a folder without plans.csv"):
             command.score(str(tmp_path / "prior"), [str(tmp_path / "plans.npz")], out=str(plans.parent))
         assert plans.read_text() == content
         assert list(plans.parent.iterdir()) == [plans]

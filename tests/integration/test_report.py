@@ -252,4 +252,4 @@ def test_units_are_named(tmp_path):
 def test_a_folder_without_a_prior_is_one_line(priors, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_plans(some_plans(), tmp_path / "new.npz")
-    fails(capsys, tmp_path / "new.npz", priors, tmp_path / "out", "config.json")
+    fails(capsys, tmp_path / "new.npz", priors, tmp_path / "out", "model.safetensors")

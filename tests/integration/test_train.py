@@ -294,7 +294,7 @@ def test_a_long_sequence_is_read_in_windows(tmp_path):
         ("PLANS --max_steps 0", ["`max_steps` must be a whole number of at least 1, got 0."]),
         ("PLANS --learning_rate=-1", ["`learning_rate`"]),
         ("PLANS --weight_decay=-1", ["`weight_decay`"]),
-        ("PLANS --out .", ["`out` must be a new or empty folder, got .; --resume ."]),
+        ("PLANS --out .", ["`out` must be a new or empty folder, got ."]),
         ("--config gru --world null", ["`plans`"]),
     ],
 )

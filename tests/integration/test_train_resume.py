@@ -10,7 +10,7 @@ import pytest
 import torch
 import yaml
 
-from neuroprior import CombinedPrior, load
+from neuroprior import CombinedPrior, UniformPrior, load, save
 from neuroprior.__main__ import main
 from neuroprior.plans import write_plans
 from neuroprior.training import PriorModule
@@ -41,7 +41,8 @@ def disk(size):
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
 MOMENTS = {
-    "configured": lambda: after(neuroprior.cli.fit, "write_whole", "run.yaml"),
+    "begun": lambda: after(neuroprior.cli.fit, "write_whole", "run.yaml"),
+    "configured": lambda: after(neuroprior.cli.fit, "write_plans"),
     "trained": lambda: after(Keeper, "on_train_epoch_end", "", 3),
     "saved": lambda: setattr(neuroprior.cli.fit_report, "score", die),
     "compared": lambda: after(neuroprior.cli.fit_report, "write_json", "metrics.json"),
@@ -91,7 +92,7 @@ def files_of(folder: Path) -> set[str]:
 LEFT = {
     "configured": ("run.yaml", "last.ckpt"),
     "trained": ("last.ckpt", "model.safetensors"),
-    "saved": ("config.json", "metrics.json"),
+    "saved": ("model.safetensors", "metrics.json"),
     "compared": ("metrics.json", "metrics.csv"),
 }
 """What is there when a run is killed, and what is not."""
@@ -114,13 +115,23 @@ def test_killed_at_any_moment_and_resumed(moment, cut, tmp_path):
     assert not [name for name in files_of(folder) if "partial" in name]
 
 
+def test_killed_before_its_plans_were_kept(cut, tmp_path, capsys):
+    """Then the same command goes on, and the message says so; another command does not."""
+    folder, whole = cut / "begun", cut / "whole"
+    assert files_of(folder) == {"run.yaml", ".neuroprior.lock"}
+    check_refusal(capsys, ["fit", "--resume", str(folder)], "give its command again")
+    check_refusal(capsys, [*small("gru", folder), *CUT, "--seed", "4"], "`out` must be a new or empty folder")
+    assert main([*small("gru", folder), *CUT]) == 0
+    assert (folder / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
+
+
 @pytest.mark.parametrize("moment", ["full", "fuller"])
 def test_a_full_disk_is_one_line(moment, cut):
     """One is full when the checkpoint is written, the other when the plans are."""
     assert f"{moment} 2" in (cut / "codes").read_text().splitlines()
     said = (cut / f"{moment}.err").read_text().splitlines()
     assert [line.split(":")[0] for line in said if not line.startswith("training: step")] == ["error"], said
-    assert ("run.yaml" in files_of(cut / moment)) == (moment == "full")
+    assert ("plans.npz" in files_of(cut / moment)) == (moment == "full")
     assert "last.ckpt" not in files_of(cut / moment)
 
 
@@ -183,7 +194,7 @@ def test_a_run_is_neither_changed_nor_overwritten(whole, capsys):
 
 
 def test_a_saved_combined_prior_is_not_learned_again(tmp_path, monkeypatch):
-    """But it is where only a part of it was saved."""
+    """But it is where another one was saved in its place."""
     write_plans(some_plans(40), tmp_path / "plans.npz")
     run, fit, fitted = tmp_path / "run", CombinedPrior.fit, []
     monkeypatch.setattr(CombinedPrior, "fit", lambda self, *a, **more: fitted.append(more) or fit(self, *a, **more))
@@ -191,8 +202,10 @@ def test_a_saved_combined_prior_is_not_learned_again(tmp_path, monkeypatch):
     assert main(["fit", str(tmp_path / "plans.npz"), *arguments]) == 0
     model, rows = (run / "model.safetensors").read_bytes(), metrics(run)["rows"]
     assert [more["max_steps"] for more in fitted] == [5]
-    for missing, times in (("metrics.json", 1), ("config.json", 2)):
-        (run / missing).unlink()
+    for other, times in ((None, 1), (UniformPrior(3), 2)):
+        (run / "metrics.json").unlink()
+        if other is not None:
+            save(other, run)
         assert main(["fit", "--resume", str(run)]) == 0
         assert len(fitted) == times
         assert metrics(run)["rows"] == rows

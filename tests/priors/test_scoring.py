@@ -86,6 +86,7 @@ def test_bad_input():
 
 def test_plans_that_were_learned_from_are_known_again(tmp_path):
     assert learned_from(tmp_path, TRAINING) == [False] * 40
+    save(PRIOR, tmp_path)
     keep_learned(tmp_path, TRAINING[:10].with_end(), TRAINING[20:25])
     known = learned_from(tmp_path, TRAINING)
     assert all(known[:10])
@@ -101,6 +102,8 @@ def test_plans_that_were_learned_from_are_known_again(tmp_path):
     nothing = Plans(TRAINING.actions[:2], 3, torch.tensor([0, 6]), action_names=NAMES)
     keep_learned(tmp_path, nothing)
     assert learned_from(tmp_path, nothing) == [False, True]
+    save(UniformPrior(3), tmp_path)  # which has not learned from them
+    assert learned_from(tmp_path, nothing) == [False, False]
 
 
 def test_scores_of_a_saved_prior_say_what_it_has_learned_from(tmp_path):

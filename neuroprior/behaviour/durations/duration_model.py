@@ -323,7 +323,6 @@ class DurationModel(SavedModule):
         rows = self.num_actions + len(self.pair)
         return (
             self.pair.dim() == 1
-            and not any(t.is_floating_point() for t in (self.pair, self.law, self.number))
             and self.law.shape == self.zero.shape == self.number.shape == (rows,)
             and self.values.shape == (rows, MOST_PARAMETERS)
             and bool(((self.law >= 0) & (self.law < len(LAW_NAMES))).all())

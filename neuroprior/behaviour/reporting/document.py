@@ -5,8 +5,7 @@ Needs pandas, matplotlib, jinja2 and rich (`neuroprior[report]`).
 
 import json
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +18,8 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.text import Text
 
-from neuroprior._files import read_json, versions, write_json, write_whole, written_whole
+from neuroprior._files import versions, write_json, write_whole, written_whole
+from neuroprior._folders import claim
 from neuroprior.behaviour.reporting.findings import Sentence
 from neuroprior.behaviour.reporting.page import Section, Table, clean, write_page
 
@@ -95,7 +95,7 @@ def publish(document: Document, folder: Path, console: Console | None = None) ->
         console: where to print; None: standard output.
 
     Raises:
-        ValueError: see `check_place`.
+        ValueError: see `write_document`.
         OSError: the files cannot be written.
 
     Example:
@@ -124,53 +124,25 @@ def show_headline(document: Document, console: Console) -> None:
         console.print(f"{mark}{sentence}", highlight=False, markup=False)
 
 
-def check_place(folder: Path, frames: Iterable[str], keys: Mapping[str, str] = {}) -> None:
-    """Raise ValueError if a document with these frames would replace a file that no earlier one wrote to a folder.
-
-    Args:
-        folder: where it is to be written.
-        frames, keys: the names of its frames, and its keys, see `Document`.
-    """
-    earlier = _earlier(folder)
-    names = [] if earlier else [RESULTS, PAGE]
-    names += [f"{name}.csv" for name in frames if keys.get(name, name) not in earlier]
-    for path in (folder / name for name in names):
-        if path.exists():
-            raise ValueError(
-                f"out: {path} is there, and of no earlier report; give another folder, or move it away: finished jobs"
-                " are kept"
-            )
-
-
-def _earlier(folder: Path) -> dict[str, Any]:
-    """The results of an earlier document in a folder; empty if there is none."""
-    with suppress(OSError, ValueError):
-        content = read_json(folder / RESULTS)
-        return content if isinstance(content, dict) and {"settings", "versions"} <= content.keys() else {}
-    return {}
-
-
 def write_document(document: Document, folder: Path) -> None:
     """Write `report.html`, `results.json` and a CSV file for each frame to a folder, which is made if it is not there.
 
-    CSV files of an earlier document there, whose frames this one does not have, are removed.
+    Results of an earlier run there are removed.
 
     Raises:
-        ValueError: see `check_place`.
+        ValueError: a file of one of these names is there, and no run wrote it; or another run uses the folder.
         OSError: the files cannot be written.
     """
-    check_place(folder, document.frames, document.keys)
-    folder.mkdir(parents=True, exist_ok=True)
-    names, content = {key: name for name, key in document.keys.items()}, _earlier(folder)
-    earlier = {names.get(key, key) for key, rows in content.items() if isinstance(rows, list)} - {*document.frames}
-    write_frames(folder, dict.fromkeys(earlier, pd.DataFrame()))
-    write_json(folder / RESULTS, results_of(document))  # before the tables: it says that they are its own
-    write_frames(folder, document.frames)
-    for name, graph in document.graphs.items():
-        write_graph(folder / name, graph)
-    shown = {**document.settings, **{f"version: {name}": number for name, number in versions().items()}}
-    top = document.said
-    write_page(folder / PAGE, document.title, top, document.sections, shown, document.command, document.status)
+    with claim(folder, replaces=True) as place:
+        graphs = [f"{name}.{ending}" for name in document.graphs for ending in ("graphml", "gv")]
+        place.add([RESULTS, PAGE, *(f"{name}.csv" for name in document.tables), *graphs])
+        write_results(folder, results_of(document))
+        write_frames(folder, document.frames)
+        for name, graph in document.graphs.items():
+            write_graph(folder / name, graph)
+        shown = {**document.settings, **{f"version: {name}": number for name, number in versions().items()}}
+        top = document.said
+        write_page(folder / PAGE, document.title, top, document.sections, shown, document.command, document.status)
 
 
 def results_of(document: Document) -> dict[str, Any]:
@@ -181,15 +153,21 @@ def results_of(document: Document) -> dict[str, Any]:
     return {**rows, **made}
 
 
+def write_results(folder: Path, content: dict[str, Any]) -> None:
+    """Write `results.json`."""
+    with claim(folder) as place:
+        place.add([RESULTS])
+        write_json(folder / RESULTS, content)
+
+
 def write_frames(folder: Path, frames: Mapping[str, pd.DataFrame]) -> None:
-    """Write each frame as `NAME.csv`; an empty one removes the file of an earlier run."""
-    for name, frame in frames.items():
-        path = folder / f"{name}.csv"
-        if frame.empty:
-            path.unlink(missing_ok=True)
-            continue
-        with written_whole(path) as file:
-            frame.to_csv(file, index=False, lineterminator="\n")
+    """Write each frame as `NAME.csv`, but for empty ones."""
+    files = {f"{name}.csv": frame for name, frame in frames.items() if len(frame)}
+    with claim(folder) as place:
+        place.add(files)
+        for name, frame in files.items():
+            with written_whole(folder / name) as file:
+                frame.to_csv(file, index=False, lineterminator="\n")
 
 
 def write_graph(path: Path, graph: nx.DiGraph) -> None:
@@ -207,11 +185,13 @@ def write_graph(path: Path, graph: nx.DiGraph) -> None:
 
 def write_figures(folder: Path, figures: Mapping[str, Figure], kind: FigureKind = "png") -> None:
     """Write each figure as `NAME.png`, `.pdf` or `.svg`; the folder is made if it is not there."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, figure in figures.items():
-        with written_whole(folder / f"{name}.{kind}", "wb") as file, warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Glyph .* missing from font")
-            figure.savefig(file, format=kind, dpi=150, bbox_inches="tight", facecolor="white")
+    files = {f"{name}.{kind}": figure for name, figure in figures.items()}
+    with claim(folder) as place:
+        place.add(files)
+        for name, figure in files.items():
+            with written_whole(folder / name, "wb") as file, warnings.catch_warnings():
+                warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+                figure.savefig(file, format=kind, dpi=150, bbox_inches="tight", facecolor="white")
 
 
 def records(frame: pd.DataFrame) -> list[dict[str, Any]]:

@@ -10,13 +10,21 @@ from typing import Any, NamedTuple
 import torch
 
 from neuroprior._checks import check_choices, check_count
+from neuroprior._folders import claim, claim_out
 from neuroprior._jobs import Progress, in_words, saying
 from neuroprior._threads import one_thread
 from neuroprior.behaviour.durations.past_durations import PastDurations
 from neuroprior.behaviour.reading.read import read_recordings
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.recordings import Recordings
-from neuroprior.behaviour.reporting.document import Document, FigureKind, check_place, write_document, write_figures
+from neuroprior.behaviour.reporting.document import (
+    PAGE,
+    RESULTS,
+    Document,
+    FigureKind,
+    write_document,
+    write_figures,
+)
 from neuroprior.behaviour.reporting.findings import headline
 from neuroprior.behaviour.reporting.fits import (
     ACTIONS,
@@ -64,6 +72,7 @@ LONG_ENOUGH = 20
 """Actions from which on equal plans are thought to be the same one."""
 
 
+@claim_out
 def report(
     plans: Plans | Recordings | Files,
     *,
@@ -117,7 +126,8 @@ def report(
     reading = reading or ReadOptions()
     file = "" if isinstance(plans, Plans | Recordings) else name_files(plans)
     if out is not None:
-        check_place(Path(out), ["plans"] if "scores" in sections else [], KEYS)  # before hours of work
+        with claim(Path(out)) as claimed:
+            claimed.check([RESULTS, PAGE, *(["plans.csv"] if "scores" in sections else [])])  # before hours of work
     files = plans
     if not isinstance(plans, Plans | Recordings) and is_recording(plans):
         with saying(f"reading {file}"):
@@ -249,8 +259,6 @@ def _cross_validate(
         for seconds in run.each(some, cost=lambda job: COSTS[job.kind], **how):
             yield _Stage(found, (), _still(f"networks (about {in_words(seconds)} more)", *later[1:]))
 
-    if out is not None:
-        Path(out).mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory() as temporary:
         run = cross_validation(Path(out or temporary), learned, other, design)
         found, modes = evaluated([]), "" if fits.modes is None else "hidden modes"

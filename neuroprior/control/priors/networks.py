@@ -20,6 +20,7 @@ from neuroprior.plans.folds import check_alike
 from neuroprior.plans.sequences import Sequences
 from neuroprior.priors.neural.features import Standardise
 from neuroprior.priors.neural.gru import gru_step
+from neuroprior.priors.neural.neural import check_layers
 
 MIN_STD = 1e-3
 """The least standard deviation of a component, as a share of the range between the bounds."""
@@ -152,7 +153,8 @@ class VectorGRU(VectorPrior):
     ) -> None:
         super().__init__(action_low, action_high, context_size)
         check_sizes(width=width, num_layers=num_layers, num_components=num_components, order=order)
-        check_memory(48 * num_layers * width**2, num_layers=num_layers, width=width)
+        check_memory(24 * width**2, width=width)
+        check_layers(num_layers, 24 * width**2)
         if not is_number(dropout) or not 0 <= dropout < 1:
             raise ValueError(f"`dropout` must be at least 0 and below 1, got {dropout!r}")
         check_seed(seed)

@@ -7,12 +7,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_count, check_sizes, is_number
+from neuroprior._checks import check_sizes, is_number
 from neuroprior.priors.counts.histories import Counts, Tree, level_bounds, parent_rows, row_blocks
-from neuroprior.priors.counts.history_prior import HistoryPrior
-
-MOST_DEPTH = 10_000
-"""Actions of a history; more take too long to walk through."""
+from neuroprior.priors.counts.history_prior import HistoryPrior, check_depth
 
 _PAIRS = ("pair_row", "pair_action", "pair_count")
 
@@ -97,9 +94,7 @@ class ContextTreePrior(HistoryPrior):
         base: Literal["frequencies", "uniform"] = "frequencies",
         num_contexts: int | None = None,
     ) -> None:
-        check_count("depth", depth, 0)
-        if depth > MOST_DEPTH:
-            raise ValueError(f"`depth` must be at most {MOST_DEPTH}, got {depth}")
+        check_depth("depth", depth)
         if beta is not None and (not is_number(beta) or not 0 < beta < 1):
             raise ValueError(f"`beta` must be a number between 0 and 1, got {beta!r}")
         if alpha is not None and (not is_number(alpha) or not 0 < alpha < float("inf")):
@@ -179,7 +174,7 @@ class ContextTreePrior(HistoryPrior):
         limits = (rows, self.num_actions, 2**63 - 1)
         return (
             super().tables_fit()
-            and all(not t.is_floating_point() and t.dim() == 1 for t in whole)
+            and all(t.dim() == 1 for t in whole)
             and self.pair_action.numel() == self.pair_count.numel() == pairs
             and all(0 <= t < limit for v, limit in zip(whole[1:], limits, strict=True) for t in _extremes(v))
             and len(bounds) == (2 * self.depth + 2 if rows else 2)

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from neuroprior._checks import check_count
 from neuroprior._random import draw_seed
 from neuroprior._threads import share
 from neuroprior.plans import Plans, action_dtype
@@ -22,7 +23,17 @@ numba, which takes about a second.
 LARGEST, RUNS = 2**17, 256
 """The most numbers in the tables that it draws from, and in a row of them."""
 
+MOST_DEPTH = 10_000
+"""Actions of a history; more take too long to walk through."""
+
 _TABLES = ("next_node", "parent", "start_node", "row_code", "log_probs")
+
+
+def check_depth(name: str, depth: int) -> None:
+    """Raise ValueError, naming the argument, unless it is a number of past actions, from 0 to `MOST_DEPTH`."""
+    check_count(name, depth, 0)
+    if depth > MOST_DEPTH:
+        raise ValueError(f"`{name}` must be at most {MOST_DEPTH}, got {depth}")
 
 
 class HistoryPrior(Prior):
@@ -48,6 +59,8 @@ class HistoryPrior(Prior):
 
     tables: tuple[str, ...] = _TABLES
     """The names of the buffers whose sizes depend on what was learned."""
+
+    log_tables = ("log_probs",)
 
     openings = True
     """Whether all actions since a plan's beginning are a history of their own."""
@@ -224,10 +237,8 @@ class HistoryPrior(Prior):
     def tables_fit(self) -> bool:
         """Whether the tables are those of a prior of this kind; checks what was read from a file."""
         nodes, rows, contexts = len(self.next_node), len(self.log_probs), self.num_contexts or 1
-        whole = (self.next_node, self.parent, self.start_node, self.row_code)
         return (
-            all(not t.is_floating_point() for t in whole)
-            and self.next_node.shape == (nodes, self.num_actions)
+            self.next_node.shape == (nodes, self.num_actions)
             and self.log_probs.shape == (rows, self.num_actions)
             and self.parent.shape == (nodes,)
             and self.start_node.shape == ()
@@ -235,5 +246,4 @@ class HistoryPrior(Prior):
             and all(int(t.min()) >= 0 and int(t.max()) < nodes for t in (self.next_node, self.parent, self.start_node))
             and (rows == 1 or (int(self.row_code.min()) >= 0 and int(self.row_code.max()) < nodes * contexts))
             and (self.num_contexts is not None or rows == 1 or rows == nodes + 1)
-            and not bool(self.log_probs.isnan().any())
         )

@@ -7,10 +7,10 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_count, is_number
+from neuroprior._checks import is_number
 from neuroprior.plans import Plans
 from neuroprior.priors.counts.histories import Counts, Tree, level_bounds, parent_rows, row_blocks
-from neuroprior.priors.counts.history_prior import HistoryPrior
+from neuroprior.priors.counts.history_prior import HistoryPrior, check_depth
 from neuroprior.priors.learning import plans_for, training_plans
 
 Backoff = Literal["dirichlet", "witten-bell", "kneser-ney"]
@@ -90,7 +90,7 @@ class MarkovPrior(HistoryPrior):
         num_contexts: int | None = None,
         backoff: Backoff = "kneser-ney",
     ) -> None:
-        check_count("order", order, 0)
+        check_depth("order", order)
         if not is_number(smoothing) or not 0 < smoothing < float("inf"):
             raise ValueError(f"`smoothing` must be a positive finite number, got {smoothing!r}")
         if initial not in ("joint", "lower"):

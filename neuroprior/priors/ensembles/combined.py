@@ -113,6 +113,8 @@ class CombinedPrior(MixturePrior):
     tracking: Tensor
     """`[E + 1]`: the logarithms of the initial weights of experts and pool in the fixed share; empty without it."""
 
+    log_tables = ("first", "tracking")
+
     actions_at_once = 2**16
 
     def __init__(

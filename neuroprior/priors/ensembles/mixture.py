@@ -61,6 +61,8 @@ class MixturePrior(Prior):
     first: Tensor
     """`[E]`: the logarithms of the initial weights."""
 
+    log_tables: tuple[str, ...] = ("first",)
+
     def __init__(
         self,
         num_actions: int,

@@ -268,7 +268,7 @@ class Mixer(NeuralPrior):
     ) -> None:
         layers = {} if num_layers is None else {"num_layers": num_layers}
         check_sizes(hidden_size=hidden_size, num_experts=num_experts, **layers)
-        check_memory(24 * layers.get("num_layers", 1) * hidden_size**2, hidden_size=hidden_size, **layers)
+        check_memory(24 * hidden_size**2, hidden_size=hidden_size)
         self.num_experts, self.contexts = num_experts, contexts
         size = num_experts * num_actions + (0 if contexts is None else 1 + num_actions)
         super().__init__(num_actions, hidden_size, None, 1, dropout, None, size, seed, num_layers)

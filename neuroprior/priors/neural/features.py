@@ -41,7 +41,7 @@ class Standardise(nn.Module):
         super().__init__()
         self.register_buffer("mean", torch.zeros(size))
         self.register_buffer("std", torch.ones(size))
-        self.register_buffer("most", torch.tensor(torch.inf))
+        self.register_buffer("most", torch.tensor(torch.finfo(torch.float).max))
 
     def learn_from(self, plans: Sequences) -> None:
         """`learn` from the contexts of plans, those of each plan or of each step.

@@ -57,7 +57,7 @@ class GRUPrior(NeuralPrior):
         sizes = {"num_layers": num_layers, "hidden_size": hidden_size}
         given = {name: size for name, size in sizes.items() if size is not None}
         check_sizes(**given)
-        check_memory(24 * given.get("num_layers", 1) * given.get("hidden_size", 1) ** 2, **given)
+        check_memory(24 * given.get("hidden_size", 1) ** 2, **given)
         super().__init__(num_actions, hidden_size, window, lags, dropout, num_contexts, context_size, seed, num_layers)
 
     @property

@@ -32,6 +32,10 @@ KINDS = 16
 """With more different actions than this, a large network predicts better."""
 
 
+MAX_LAYERS = 1000
+"""More take long to make, whatever their width."""
+
+
 class Sizes(NamedTuple):
     """What a network is made with, where it is not given.
 
@@ -61,6 +65,13 @@ class Sizes(NamedTuple):
         if few or plans.num_actions <= KINDS:
             return cls(64 if few else 128, 1, 0.3, 2)
         return cls(256, 1, 0.4, 2)
+
+
+def check_layers(num_layers: int, size: int) -> None:
+    """Raise ValueError unless a network can have so many layers, of `size` bytes each."""
+    if num_layers > MAX_LAYERS:
+        raise ValueError(f"`num_layers` must be at most {MAX_LAYERS}, got {num_layers}")
+    check_memory(size * num_layers, num_layers=num_layers)
 
 
 class NeuralPrior(Prior):
@@ -129,6 +140,7 @@ class NeuralPrior(Prior):
         """Make the layers, with the sizes that were given and these where none were."""
         made = [own if own is not None else size for own, size in zip(self._given, sizes, strict=True)]
         self.width, self.lags, self.dropout, self.num_layers = int(made[0]), int(made[1]), float(made[2]), int(made[3])
+        check_layers(self.num_layers, 24 * self.width**2)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self._seed)
             self.build()

@@ -12,7 +12,7 @@ from neuroprior._checks import check_count, check_memory, check_share, check_siz
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.counts.histories import Counts, Tree
-from neuroprior.priors.counts.history_prior import HistoryPrior
+from neuroprior.priors.counts.history_prior import HistoryPrior, check_depth
 from neuroprior.priors.learning import counted_plans, plans_for, training_plans
 from neuroprior.priors.prior import taken_of
 from neuroprior.priors.switching.forward_backward import TINY, Smoothed, most_probable_path, predict, smooth
@@ -143,7 +143,7 @@ class SwitchingPrior(HistoryPrior):
         check_sizes(num_modes=num_modes, phases=phases, folds=folds, restarts=restarts)
         if num_contexts is not None:
             check_sizes(num_contexts=num_contexts)
-        check_count("order", order, 0)
+        check_depth("order", order)
         check_count("max_iterations", max_iterations, 0)
         numbers: dict[str, object] = {"smoothing": smoothing, "stay": stay, "tolerance": tolerance}
         for name, value in numbers.items():
@@ -404,7 +404,7 @@ class SwitchingPrior(HistoryPrior):
         self.log_probs = whole[:, 0]
         fit = super().tables_fit()
         self.log_probs = whole
-        return fit and not bool(whole.isnan().any() or self.first.isnan().any() or self.transitions.isnan().any())
+        return fit
 
 
 class _Part(NamedTuple):

@@ -225,11 +225,9 @@ class LogLinearPrior(Prior):
         known, actions = len(self.patterns), self.num_actions
         return (
             self.patterns.shape == (known,)
-            and self.patterns.dtype == torch.int32
             and self.weights.shape == (known + 1, actions)
             and self.after.shape == (actions + 1, actions)
             and bool((self.patterns.diff() > 0).all())
-            and not bool(self.weights.isnan().any() | self.after.isnan().any())
         )
 
 

@@ -113,7 +113,12 @@ def test_plans_in_memory_and_in_a_file_have_the_same_report(tmp_path, made):
     again = report(tmp_path / "plans.npz", sections=["scores"], out=tmp_path / "out", **ASKED)
     pd.testing.assert_frame_equal(again.tables["plans"], made.tables["plans"])
     assert (made.title, again.title) == ("Report", "Report on plans.npz")
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.html", "results.json", "plans.csv", "folds"}
+    assert {path.name for path in (tmp_path / "out").glob("[!.]*")} == {
+        "report.html",
+        "results.json",
+        "plans.csv",
+        "folds",
+    }
 
 
 PLANS = markov_plans(markov_probs(3, 1, 0), 8, 5, 1)

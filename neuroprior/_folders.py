@@ -1,0 +1,168 @@
+"""A folder belongs to one run: it is claimed, cleared of what a killed run left, and knows which files are its own."""
+
+import inspect
+import json
+import os
+import platform
+import random
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
+from functools import wraps
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+from neuroprior._files import clear, is_at, lock, read_json, write_whole
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+LOCK, FILES = ".neuroprior.lock", ".neuroprior.json"
+"""In a folder: what its run holds locked, which goes with the run; and the names of the results there."""
+
+SECONDS = 1.0
+"""For which a run waits for a folder."""
+
+
+class Claim:
+    """A folder that a run has claimed; see `claim`.
+
+    Attributes:
+        folder: its path.
+    """
+
+    def __init__(self, folder: Path, replaces: bool, owns_all: bool) -> None:
+        self.folder, self._replaces, self._owns_all, self._times = folder, replaces, owns_all, 1
+
+    def check(self, names: Iterable[str]) -> None:
+        """Raise ValueError if a file of one of these names is there, and no earlier run wrote it as a result."""
+        known = self._known()
+        for name in names:
+            if name not in known and not self._owns_all and os.path.lexists(self.folder / name):
+                raise ValueError(
+                    f"`out` must be a folder without {name}, or with that of an earlier run, got {self.folder}."
+                )
+
+    def add(self, names: Iterable[str]) -> None:
+        """Enter files that are written next as results of this run.
+
+        The first ones take the place of all results that are there: these are removed, so that no two runs' results are
+        mixed, whenever a run is killed.
+
+        Raises:
+            ValueError: see `check`.
+        """
+        names = {*names}
+        if not names or self._owns_all:
+            return
+        self.check(names)
+        known = self._known()
+        if self._replaces:
+            self._replaces = False
+            for name in known:
+                (self.folder / name).unlink(missing_ok=True)
+            known = set()
+        if not names <= known:
+            content = json.dumps({"files": sorted(known | names)}, indent=2) + "\n"
+            write_whole(self.folder / FILES, content.encode())  # before the files: whoever is killed then owns them
+
+    def _known(self) -> set[str]:
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            files = read_json(self.folder / FILES)["files"]
+            return {name for name in files if isinstance(name, str) and Path(name).name == name}
+        return set()
+
+
+_claims = threading.local()
+
+
+@contextmanager
+def claim(
+    folder: Path, *, replaces: bool = False, owns_all: bool = False, name: str = "out", seconds: float = SECONDS
+) -> Iterator[Claim]:
+    """Claim a folder, which is made if need be; the thread that has claimed it may do so again, and shares its claim.
+
+    The lock is the system's, which releases it however the process ends.
+
+    Args:
+        folder: where.
+        replaces: the results of this run are to take the place of those of earlier ones, see `Claim.add`.
+        owns_all: everything in the folder is the run's own.
+        name: of the argument, for the message.
+        seconds: for which to wait until another run has released the folder.
+
+    Raises:
+        ValueError: another run has claimed it.
+        OSError: it cannot be written.
+    """
+    place, claims = os.path.realpath(folder), vars(_claims)
+    if place in claims:
+        claims[place]._times += 1
+        try:
+            yield claims[place]
+        finally:
+            claims[place]._times -= 1
+        return
+    made = [one for one in (Path(place), *Path(place).parents) if not one.exists()]
+    descriptor = _lock(Path(place), folder, name, seconds)
+    claims[place] = Claim(folder, replaces, owns_all)
+    try:
+        clear(Path(place))
+        yield claims[place]
+    finally:
+        del claims[place]
+        with suppress(OSError):
+            os.unlink(os.path.join(place, LOCK))  # still locked: who waits for it finds that it is another file
+        os.close(descriptor)
+        for one in made:  # unless something was written there
+            with suppress(OSError):
+                one.rmdir()
+
+
+def claim_out(function: F) -> F:
+    """Let a function claim the folder that its argument `out` names while it runs, unless this is None.
+
+    Its results take the place of those of earlier runs there.
+    """
+    signature = inspect.signature(function)
+
+    @wraps(function)
+    def claiming(*given: Any, **named: Any) -> Any:
+        bound = signature.bind(*given, **named)
+        bound.apply_defaults()
+        out = bound.arguments["out"]
+        with nullcontext() if out is None else claim(Path(out), replaces=True):
+            return function(*given, **named)
+
+    return cast(F, claiming)
+
+
+def _lock(place: Path, folder: Path, name: str, seconds: float) -> int:
+    """A descriptor that holds the lock of a folder."""
+    until = time.monotonic() + seconds
+    while True:
+        place.mkdir(parents=True, exist_ok=True)
+        try:
+            flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+            descriptor = os.open(place / LOCK, flags, 0o666)
+        except FileNotFoundError:
+            continue  # a run that failed has just removed its folder
+        locked = lock(descriptor)
+        if locked is None:
+            message = f"{folder}: its file system has no locks; two runs that write there at a time are not told apart"
+            warnings.warn(message, stacklevel=4)
+            return descriptor
+        if locked and is_at(descriptor, place / LOCK):
+            os.ftruncate(descriptor, 0)
+            os.write(descriptor, f"process {os.getpid()} on {platform.node()}".encode())
+            return descriptor
+        owner = ""
+        with suppress(OSError):  # Windows keeps others from reading what is locked
+            owner = os.read(descriptor, 200).decode(errors="replace")
+        os.close(descriptor)
+        if not locked and time.monotonic() > until:
+            raise ValueError(
+                f"`{name}` must be a folder that no other run uses, got {folder}, in use by {owner or 'another run'}."
+            )
+        time.sleep(random.uniform(0.001, 0.01))
