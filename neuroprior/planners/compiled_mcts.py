@@ -19,6 +19,7 @@ from neuroprior.priors.counts.history_prior import HistoryPrior
 from neuroprior.priors.neural.compiled_gru import BLOCK, Network, advance, on_one_thread
 from neuroprior.priors.neural.gru import GRUPrior
 from neuroprior.priors.uniform import UniformPrior
+from neuroprior.sampling.draws import check_possible
 from neuroprior.sampling.stepping import Steppable, Stepper
 from neuroprior.worlds.tabular import TabularWorld
 from neuroprior.worlds.world import World
@@ -500,8 +501,8 @@ def _search_all(
     batch, actions, length = len(state), world.num_actions, planner.length
     steps = planner.num_plans * length
     policy = policy_of(planner.prior, world, planner.temperature)
-    if any(np.isnan(part).any() for part in (policy.probs, policy.by_context, *policy.network)):
-        raise ValueError("prior: its logits are NaN")
+    parts = policy.probs, policy.by_context, *policy.network
+    check_possible(not any(np.isnan(part).any() for part in parts))
     logits, hidden = Stepper(planner.prior).start_in(world, state)
     (layers, size, _), most = policy.network.recurrent.shape, batch * length * (1 + actions)
     room, number = max(min(DRAWS // most, 2 * planner.num_plans), 1), 0

@@ -21,7 +21,7 @@ from neuroprior.sampling.draws import (
 )
 from neuroprior.sampling.prefixes import Prefixes
 from neuroprior.sampling.states import State, map_state, numbers_in, select_rows
-from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
+from neuroprior.sampling.stepping import Steppable, Stepper, check_outputs, legal_logits
 from neuroprior.worlds.world import Rollout, World, join_states, step_alive
 
 Mask: TypeAlias = Callable[[Tensor], Any]
@@ -317,16 +317,14 @@ def _checked_state(state: tuple[Tensor, State], num_plans: int, num_actions: int
     Raises:
         ValueError: it is none.
     """
-    try:
-        logits, hidden = state
-        rows, columns = logits.shape
-    except (TypeError, ValueError, AttributeError):
-        raise ValueError("`state` must be what `start` or `step` returned, logits [N, A] and a state") from None
-    if columns != num_actions or rows not in (1, num_plans):
+    shape = list(getattr(state[0], "shape", [])) if isinstance(state, tuple) and state else []
+    if len(shape) != 2:
+        raise ValueError("`state` must be what `start` or `step` returned, logits [N, A] and a state")
+    if shape[1] != num_actions or shape[0] not in (1, num_plans):
         raise ValueError(
-            f"`state` must be of 1 row or of num_plans = {num_plans}, with {num_actions} logits each,"
-            f" got {[rows, columns]}"
+            f"`state` must be of 1 row or of num_plans = {num_plans}, with {num_actions} logits each, got {shape}"
         )
+    logits, hidden = check_outputs(state, shape[0], num_actions, "step")
     return logits, map_state(torch.clone, hidden)
 
 

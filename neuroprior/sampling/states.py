@@ -46,6 +46,13 @@ def tensors_in(state: State) -> list[Tensor]:
     return [state] if isinstance(state, Tensor) else [values for part in state for values in tensors_in(part)]
 
 
+def has_rows(state: State, num: int) -> bool:
+    """Returns whether a state is one of `num` plans: a tensor of so many rows, or a tuple of such states."""
+    if isinstance(state, tuple):
+        return len(state) > 0 and all(has_rows(part, num) for part in state)
+    return isinstance(state, Tensor) and state.dim() > 0 and len(state) == num
+
+
 def numbers_in(state: State) -> int:
     """Returns how many numbers a state of N plans has, N times those of a plan."""
     return sum(values.numel() for values in tensors_in(state))

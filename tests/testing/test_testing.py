@@ -147,9 +147,11 @@ def test_every_world_conforms(world: World) -> None:
 class Broken(MarkovPrior):
     """A right prior, to be broken in one place."""
 
-    def __init__(self, num_actions: int = 3, order: int = 2, **settings: object) -> None:
-        super().__init__(num_actions, order)
-        self.fit(random_plans(num_actions))
+    def __init__(
+        self, num_actions: int = 3, order: int = 2, num_contexts: int | None = None, **settings: object
+    ) -> None:
+        super().__init__(num_actions, order, num_contexts=num_contexts)
+        self.fit(random_plans(num_actions, None if num_contexts is None else index_context(60) % num_contexts))
 
 
 class WrongStep(Broken):
@@ -167,6 +169,34 @@ class HiddenMemory(Broken):
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         logits, state = super().step(action, state)
         return logits + torch.arange(len(action))[:, None] * torch.arange(self.num_actions) / 10, state
+
+
+class Together(Broken):
+    """Takes the mean of the logits of all plans that it is asked for together."""
+
+    forward = Prior.forward
+
+    def __init__(self, method: str) -> None:
+        super().__init__(num_contexts=2)
+        self.method = method
+
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        logits, state = super().start(batch_size, context)
+        return logits.mean(0).expand_as(logits) if self.method == "start" else logits, state
+
+    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        logits, state = super().step(action, state, context)
+        return logits.mean(0).expand_as(logits) if self.method == "step" else logits, state
+
+
+class AllTogether(Broken):
+    def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
+        return super().forward(plans, context).mean(0).expand(*plans.shape, -1)
+
+
+class WholeNumbers(Broken):
+    def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
+        return super().forward(plans, context).long()
 
 
 class Unnormalised(Broken):
@@ -269,17 +299,21 @@ class Unsavable(Broken):
     ("broken", "message"),
     [
         (WrongStep, "stepping differs from forward"),
-        (HiddenMemory, "stepping differs from forward|reordering the state"),
+        (HiddenMemory, "stepping differs from forward|with the plans beside it"),
+        (partial(Together, "start"), "^forward: the logits of a plan change by .* nats with the plans beside it"),
+        (partial(Together, "step"), "^forward: the logits of a plan change by .* nats with the plans beside it"),
+        (AllTogether, "^forward: the logits of a plan change by .* nats with the plans beside it"),
         (Unnormalised, "sum to 1.1"),
         (WrongSamples, "do not fit log_prob"),
         (GlobalRandomness, "same seed gave other plans|global generator"),
         (partial(Forgetful, bonus=1.0), "saved, loaded"),
         (ReadsContext, "step: .* `step` is given None where the last context goes on"),
         (Unsavable, "cannot be saved and loaded"),
-        (OneMore, r"^start must return floating point logits \[7, 3\], got torch.float32 \[7, 4\]$"),
-        (Integers, r"^step must return floating point logits \[7, 3\], got torch.int64 \[7, 3\]$"),
-        (Arrays, r"^start must return floating point logits \[7, 3\], got ndarray$"),
-        (LogitsAlone, "^start must return logits and a state$"),
+        (OneMore, r"^`start` must return floating point logits \[7, 3\], got torch.float32 \[7, 4\]$"),
+        (Integers, r"^`step` must return floating point logits \[7, 3\], got torch.int64 \[7, 3\]$"),
+        (WholeNumbers, r"^`forward` must return floating point logits \[7, 1, 3\], got torch.int64 \[7, 1, 3\]$"),
+        (Arrays, r"^`start` must return floating point logits \[7, 3\], got ndarray$"),
+        (LogitsAlone, r"^`start` must return logits and a state, got torch.float32 \[7, 3\]$"),
         (Overwrites, "^step must leave the state that it is given as it is, and return another$"),
         (FitsToNothing, "^fit must return the prior itself, got NoneType$"),
     ],
