@@ -378,6 +378,8 @@ class Prior(SavedModule):
         """
         if action.device.type != "cpu":
             return
+        if action.dim() != 1:
+            raise ValueError(f"`action` must be integers [N], got {describe(action)}")
         check_range("action", action, self.num_actions, "actions")
         if context is not None:
             self.check_context_of(context, len(action))

@@ -6,6 +6,7 @@ from typing import Any, TypeAlias
 import torch
 from torch import Tensor
 
+from neuroprior._checks import describe, is_integer
 from neuroprior.sampling.rows import rows_of
 
 State: TypeAlias = Any
@@ -33,6 +34,10 @@ def select_rows(state: State, row: Tensor | slice) -> State:
     """
     if isinstance(row, slice):
         return map_state(lambda values: values[row], state)
+    if row.dtype not in (torch.int32, torch.int64):  # the only ones that torch selects by
+        if not is_integer(row):
+            raise ValueError(f"`row` must be integers [M] or a slice, got {describe(row)}")
+        row = row.long()
     return map_state(lambda values: rows_of(values, row), state)
 
 

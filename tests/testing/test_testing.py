@@ -43,6 +43,17 @@ def index_context(*shape: int) -> Tensor:
     return torch.randint(3, shape, generator=torch.Generator().manual_seed(4))
 
 
+def random_context(prior: Prior, num: int, length: int, generator: torch.Generator) -> Tensor | None:
+    """A context of each step, of the kind that the prior takes."""
+    if prior.context_size is not None:
+        return torch.randn(num, length, prior.context_size, generator=generator)
+    if prior.num_patterns is not None:
+        return torch.randint(6, (num, length, prior.num_patterns), generator=generator)
+    if prior.num_contexts is None:
+        return None
+    return torch.randint(prior.num_contexts, (num, length), generator=generator)
+
+
 def pattern_context(*shape: int) -> Tensor:
     return torch.randint(6, (*shape, 2), generator=torch.Generator().manual_seed(5), dtype=torch.int32)
 
@@ -101,47 +112,114 @@ def legal_world() -> TabularWorld:
     return TabularWorld(torch.tensor([[1, 2], [0, 0], [2, 0]]), torch.rand(2, 3, 2), legal)
 
 
-@pytest.mark.parametrize(
-    "world",
-    [
-        gridworld(5, 4, "wall", num_worlds=3),
-        gridworld(20, 20, "torus"),
-        gridworld(1, 1),
-        legal_world(),
-        cube(),
-        cube("quarter", scramble=3),
-        stochastic_world(0),
-        maze(7, 9, num_layouts=3, num_worlds=2),
-        four_rooms(egocentric=True, view=2, reward="goal"),
-        egocentric(gridworld(5, 5, "torus")),
-        from_gymnasium("Taxi-v4"),
-        from_gymnasium("FrozenLake-v1", starts="any"),
-        from_gymnasium("CartPole-v1", seeds=range(3)),
-        sokoban(SOKOBAN),
-        sliding_tiles(shape=(3, 3)),
-        sliding_tiles(shape=(2, 4), scramble=5),
-    ],
-    ids=[
-        "walls",
-        "torus",
-        "one cell",
-        "legal",
-        "cube",
-        "cube, quarter turns",
-        "chance",
-        "maze",
-        "four rooms",
-        "egocentric",
-        "taxi",
-        "ice",
-        "cart and pole",
-        "sokoban",
-        "sliding tiles",
-        "sliding tiles, no square",
-    ],
-)
+WORLDS = {
+    "walls": gridworld(5, 4, "wall", num_worlds=3),
+    "torus": gridworld(20, 20, "torus"),
+    "one cell": gridworld(1, 1),
+    "legal": legal_world(),
+    "cube": cube(),
+    "cube, quarter turns": cube("quarter", scramble=3),
+    "chance": stochastic_world(0),
+    "maze": maze(7, 9, num_layouts=3, num_worlds=2),
+    "four rooms": four_rooms(egocentric=True, view=2, reward="goal"),
+    "egocentric": egocentric(gridworld(5, 5, "torus")),
+    "taxi": from_gymnasium("Taxi-v4"),
+    "ice": from_gymnasium("FrozenLake-v1", starts="any"),
+    "cart and pole": from_gymnasium("CartPole-v1", seeds=range(3)),
+    "sokoban": sokoban(SOKOBAN),
+    "sliding tiles": sliding_tiles(shape=(3, 3)),
+    "sliding tiles, no square": sliding_tiles(shape=(2, 4), scramble=5),
+}
+
+
+@pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS)
 def test_every_world_conforms(world: World) -> None:
     check_world(world)
+
+
+INTEGERS = [
+    torch.int8, torch.uint8, torch.int16, torch.int32, torch.int64, torch.uint16, torch.uint32, torch.uint64
+]  # fmt: skip
+LAYOUTS: dict[str, Callable[[Tensor], Tensor]] = {
+    "strided": lambda values: torch.stack([values, values], -1)[..., 0],
+    "transposed": lambda values: values.transpose(0, -1).contiguous().transpose(0, -1),
+}
+
+
+def outcomes(prior: Prior, plans: Tensor, context: Tensor | None) -> list[Tensor]:
+    """All logits and log-probabilities of some plans."""
+    first, *rest = [None] * plans.shape[1] if context is None else context.unbind(1)
+    logits, state = prior.start(len(plans), first)
+    found = [logits]
+    for action, given in zip(plans.unbind(1), rest, strict=False):
+        logits, state = prior.step(action, state, given)
+        found.append(logits)
+    return [*found, prior(plans, context), prior.log_prob(Plans(plans, prior.num_actions, context=context))]
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", PRIORS)
+def test_integers_of_every_kind_and_layout_mean_the_same_to_a_prior(name: str) -> None:
+    prior = PRIORS[name]()
+    generator = torch.Generator().manual_seed(0)
+    plans = torch.randint(min(prior.num_actions, 100), (5, 4), generator=generator)
+    context = random_context(prior, 5, 4, generator)
+    due = outcomes(prior, plans, context)
+    for kind in INTEGERS:
+        for layout in LAYOUTS.values():
+            now = context if context is None or context.is_floating_point() else context.to(kind)
+            found = outcomes(prior, layout(plans.to(kind)), None if now is None else layout(now))
+            assert all(map(torch.allclose, found, due))
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_integers_out_of_range_are_refused_by_a_prior(name: str) -> None:
+    prior = PRIORS[name]()
+    generator = torch.Generator().manual_seed(0)
+    context = random_context(prior, 3, 2, generator)
+    _, state = prior.start(3, None if context is None else context[:, 0])
+    plans = torch.zeros(3, 2, dtype=torch.long)
+    for kind in INTEGERS:
+        values = [-1] if kind.is_signed else []
+        for wrong in [*values, *([prior.num_actions] if prior.num_actions < 128 else [])]:
+            action = torch.tensor([0, 0, wrong]).to(kind)
+            for call in (
+                lambda action=action: prior.step(action, state),
+                lambda action=action: prior(torch.stack([plans[:, 0].to(action.dtype), action], 1), context),
+                lambda action=action: prior.log_prob(Plans(torch.stack([action, action], 1), prior.num_actions)),
+            ):
+                with pytest.raises(ValueError, match="is out of range"):
+                    call()
+    for wrong in (plans[:, :1], plans[:, 0].double(), plans[:, 0] > 0):
+        with pytest.raises(ValueError, match="`action` must be integers"):
+            prior.step(wrong, state)
+
+
+@pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS)
+def test_integers_of_every_kind_and_layout_mean_the_same_to_a_world(world: World) -> None:
+    def seeded() -> torch.Generator:
+        return torch.Generator().manual_seed(1)
+
+    state, num = world.reset(6, seeded()), world.num_actions
+    plans = torch.randint(num, (6, 4, 3), generator=seeded())
+    due = [*world.step(state, plans[:, 0, 0], seeded()), *world.rollout(state, plans, seeded())[:2]]
+    for kind in INTEGERS:
+        for layout in LAYOUTS.values():
+            given = layout(plans.to(kind))
+            found = world.step(layout(state), given[:, 0, 0], seeded()), world.rollout(layout(state), given, seeded())
+            assert all(map(torch.equal, [*found[0], *found[1][:2]], due))
+        for wrong in [num, *([-1] if kind.is_signed else [])]:
+            given = plans.clone()
+            given[2, 0] = wrong
+            for call in (
+                partial(world.step, state, given[:, 0, 0].to(kind)),
+                partial(world.rollout, state, given.to(kind)),
+            ):
+                with pytest.raises(ValueError, match=f"{wrong} is out of range"):
+                    call()
+    for none in (plans[:2, 0, 0], plans[:, 0], plans[:, 0, 0].double()):
+        with pytest.raises(ValueError, match="`action` must be integers"):
+            world.step(state, none)
 
 
 class Broken(MarkovPrior):
