@@ -639,11 +639,8 @@ def _knows(prior: Steppable) -> bool:
         return True
     if isinstance(prior, HistoryPrior):
         own = type(prior)
-        same = own.start is HistoryPrior.start and own.step is HistoryPrior.step and own._at is HistoryPrior._at
-        return same and prior.log_probs.dtype == torch.float32
-    if not isinstance(prior, GRUPrior) or prior.training or not prior.is_plain:
-        return False
-    return prior.head.weight.dtype == torch.float32
+        return own.start is HistoryPrior.start and own.step is HistoryPrior.step and own._at is HistoryPrior._at
+    return isinstance(prior, GRUPrior) and not prior.training and prior.is_plain
 
 
 def policy_of(prior: Any, world: TabularWorld, temperature: float) -> Policy:

@@ -10,7 +10,7 @@ from torch import Tensor
 from neuroprior._checks import check_count, check_memory, check_range, check_sizes, describe, is_integer
 from neuroprior._random import generator_on
 from neuroprior._threads import share
-from neuroprior.plans.plans import action_dtype
+from neuroprior.plans.plans import action_dtype, as_single
 from neuroprior.plans.sequences import is_per_plan
 from neuroprior.sampling.draws import (
     Draw,
@@ -97,7 +97,7 @@ def sample(
     check_memory((each * num_plans + 4 * min(num_plans, batch_size)) * length, num_plans=num_plans, length=length)
     stepper = Stepper(prior)
     device = stepper.device
-    context = None if context is None else torch.as_tensor(context, device=device)
+    context = None if context is None else as_single(torch.as_tensor(context, device=device).detach())
     if method not in ("auto", "ancestral", "tree"):
         raise ValueError(f'`method` must be "auto", "ancestral" or "tree", got {method!r}')
     if context is not None and context.shape[0] != num_plans:

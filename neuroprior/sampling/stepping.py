@@ -9,6 +9,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_same_names, describe, is_integer
 from neuroprior._threads import one_thread
+from neuroprior.plans.plans import as_single
 from neuroprior.sampling.draws import Draw, after_end, are_few
 from neuroprior.sampling.states import State, has_rows
 from neuroprior.worlds.world import World, allowed_actions, check_is_world
@@ -194,7 +195,7 @@ def check_logits(logits: Any, shape: list[int], method: str) -> Tensor:
     """
     if not isinstance(logits, Tensor) or not logits.is_floating_point() or list(logits.shape) != shape:
         raise ValueError(f"prior: `{method}` must return floating point logits {shape}, got {describe(logits)}")
-    return logits.float() if logits.dtype.itemsize < 4 else logits
+    return as_single(logits)
 
 
 def _numbered(reached: Tensor) -> bool:

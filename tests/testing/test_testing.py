@@ -24,8 +24,10 @@ from neuroprior import (
     gridworld,
 )
 from neuroprior.behaviour import RecordedPlans, SemiMarkovPrior
+from neuroprior.control import NoisePrior
 from neuroprior.priors import AdaptivePrior
 from neuroprior.puzzles import LogLinearPrior, sliding_tiles, sokoban
+from neuroprior.sampling.states import tensors_in
 from neuroprior.testing import check_prior, check_world
 from neuroprior.testing.chi_square import alike, chi_square
 from neuroprior.worlds import Features, Rollout, cube, egocentric, four_rooms, maze
@@ -193,6 +195,41 @@ def test_integers_out_of_range_are_refused_by_a_prior(name: str) -> None:
     for wrong in (plans[:, :1], plans[:, 0].double(), plans[:, 0] > 0):
         with pytest.raises(ValueError, match="`action` must be integers"):
             prior.step(wrong, state)
+
+
+@pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float64])
+@pytest.mark.parametrize("name", [name for name in PRIORS if name.endswith("features")])
+def test_features_of_every_kind_are_read_in_single_precision(name: str, kind: torch.dtype) -> None:
+    """Eighths, which half precision holds; they may require gradients, which nothing that is kept does."""
+    prior = PRIORS[name]()
+    generator = torch.Generator().manual_seed(0)
+    plans = torch.randint(prior.num_actions, (5, 4), generator=generator)
+    context = torch.randint(-16, 16, (5, 4, prior.context_size), generator=generator) / 8
+    given = context.to(kind).requires_grad_()
+    stored = Plans(plans, prior.num_actions, context=given).context
+    assert stored is not None
+    assert stored.equal(context.to(stored))
+    logits, state = prior.start(5, given[:, 0])
+    kept = tensors_in((logits, state, prior.step(plans[:, 0], state, given[:, 1])))
+    for values in (stored, *kept):
+        assert not values.requires_grad
+        assert values.dtype.itemsize >= 4
+    found, due = (outcomes(prior, plans, values) for values in (given, context))
+    assert all(torch.allclose(one.float(), other, atol=1e-6) for one, other in zip(found, due, strict=True))
+    drawn = [prior.sample(5, 4, values, generator=generator.manual_seed(1)) for values in (given, context)]
+    assert drawn[0].equal(drawn[1])
+
+
+@pytest.mark.parametrize("make", [*PRIORS.values(), lambda: NoisePrior([-1.0], [1.0])], ids=[*PRIORS, "vectors"])
+def test_another_precision_is_refused(make: Callable[[], Prior]) -> None:
+    """And leaves the prior as it was."""
+    prior = make()
+    before = {name: values.clone() for name, values in prior.state_dict().items()}
+    for change in (prior.half, prior.bfloat16, prior.double, partial(prior.to, "cpu", torch.double)):
+        with pytest.raises(ValueError, match="must compute in single precision"):
+            change()
+    after = prior.to("cpu").float().state_dict()
+    assert all(after[name].dtype == values.dtype and after[name].equal(values) for name, values in before.items())
 
 
 @pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS)
