@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neuroprior._files import versions, write_json, written_whole
+from neuroprior._files import quote_frame, versions, write_json, written_whole
 from neuroprior._statistics import ENOUGH_UNITS, Difference, holm, ratio_difference
 from neuroprior.comparison.contestants import BASELINE
 from neuroprior.comparison.trial import TOLERANCE, Array, Outcome
@@ -187,7 +187,7 @@ class Comparison:
         frame, figure, folder = self.frame(), self.figure(), Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         with written_whole(folder / "comparison.csv") as file:
-            frame.to_csv(file, index=False)
+            quote_frame(frame).to_csv(file, index=False)
         with written_whole(folder / "comparison.png", "wb") as file:
             figure.savefig(file, format="png", dpi=150)
         seeds = [

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from neuroprior._checks import check_memory, check_single_precision, is_whole, warn_caller
-from neuroprior._files import MISSING_LABELS
+from neuroprior._files import MISSING_LABELS, unquote_cell
 
 Integers = NDArray[np.integer[Any]]
 Floats = NDArray[np.floating[Any]]
@@ -119,7 +119,7 @@ class Column(dict[str, int]):
 
     def __missing__(self, text: str) -> int:
         """Number a new text; ValueError (which does not know the line) for one that is neither a number nor a name."""
-        label = text.strip() if self.untyped else text
+        label = unquote_cell(text.strip()) if self.untyped else text
         if self.blank and is_missing(label) and label not in (self.names or ()):
             number = -1
         else:

@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.text import Text
 
-from neuroprior._files import read_json, versions, write_json, write_whole, written_whole
+from neuroprior._files import quote_frame, read_json, versions, write_json, write_whole, written_whole
 from neuroprior.behaviour.reporting.findings import Sentence
 from neuroprior.behaviour.reporting.page import Section, Table, clean, write_page
 
@@ -190,7 +190,7 @@ def write_frames(folder: Path, frames: Mapping[str, pd.DataFrame]) -> None:
             path.unlink(missing_ok=True)
             continue
         with written_whole(path) as file:
-            frame.to_csv(file, index=False, lineterminator="\n")
+            quote_frame(frame).to_csv(file, index=False, lineterminator="\n")
 
 
 def write_graph(path: Path, graph: nx.DiGraph) -> None:
