@@ -26,6 +26,48 @@ MISSING_LABELS = (
 """What stands for no label in tables, in lower case."""
 
 
+FORMULA = re.compile(r"'*[=+@\t\r-]")
+"""How a cell begins that a spreadsheet takes for a formula; an apostrophe before it says that it is a text."""
+
+
+def quote_cell(text: str) -> str:
+    """Returns a name as a cell of a CSV file: an apostrophe before what would be a formula. Numbers stay as they are.
+
+    Example:
+        >>> quote_cell("=1+1"), quote_cell("-1"), quote_cell("rest")
+        ("'=1+1", '-1', 'rest')
+    """
+    return f"'{text}" if FORMULA.match(text) and _is_text(text.lstrip("'")) else text
+
+
+def unquote_cell(text: str) -> str:
+    """Returns the name that `quote_cell` wrote as a cell.
+
+    Example:
+        >>> unquote_cell("'=1+1"), unquote_cell("'tis")
+        ('=1+1', "'tis")
+    """
+    return text[1:] if text.startswith("'") and quote_cell(text[1:]) == text else text
+
+
+def quote_frame(frame: Any) -> Any:
+    """Returns a frame of pandas with its names, in cells and of columns, as `quote_cell` writes them."""
+
+    def cell(value: Any) -> Any:
+        return quote_cell(value) if isinstance(value, str) else value
+
+    return frame.apply(lambda column: column.map(cell) if column.dtype.kind == "O" else column).rename(columns=cell)
+
+
+def _is_text(text: str) -> bool:
+    """Whether a cell is neither a number nor what stands for no label."""
+    try:
+        float(text)
+    except ValueError:
+        return text.strip().lower() not in MISSING_LABELS
+    return False
+
+
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write an object as JSON; numbers that are not finite, which JSON does not have, become null."""
     write_whole(path, json.dumps(_finite(content), indent=2, allow_nan=False).encode() + b"\n")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neuroprior._checks import is_number
-from neuroprior.plans.columns import as_single, check_names, listed, padded
+from neuroprior.plans.columns import as_single, check_names, count_up_to, listed, padded
 from neuroprior.plans.plans import Plans, as_integers, as_numbers, check_numbered, check_shape, check_texts
 
 CONTROLS = frozenset(
@@ -226,7 +226,7 @@ def plans_of_events(
     labels = [str(label) for label in pd.unique(behaviour)]
     if all(label.isdecimal() for label in labels) and not (names is not None and set(labels) <= set(names)):
         actions = pd.to_numeric(events["behaviour"]).to_numpy(np.int64)
-        count = num_actions or (int(actions.max()) + 1 if names is None else len(names))
+        count = num_actions or (count_up_to(int(actions.max())) if names is None else len(names))
         if names is not None:
             order = listed([f"{number} = {name}" for number, name in enumerate(names)])
             notes.append(f"the behaviours are numbers, and are taken for those of the names: {order}")

@@ -9,7 +9,7 @@ import torch
 from jsonargparse.typing import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from neuroprior._files import written_whole
+from neuroprior._files import quote_frame, written_whole
 from neuroprior.behaviour.durations.semi_markov import SemiMarkovPrior
 from neuroprior.behaviour.recorded_plans import durations_of
 from neuroprior.plans import Plans, write_plans
@@ -57,7 +57,7 @@ def sample(
     if out is not None:
         if timed and Path(out).suffix.lower() == ".csv":
             with written_whole(Path(out)) as stream:
-                _events(plans).to_csv(stream, index=False, lineterminator="\n")
+                quote_frame(_events(plans)).to_csv(stream, index=False, lineterminator="\n")
         else:
             write_plans(plans, out)
         print(f"wrote {num_plans} plans to {out}")

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neuroprior._files import versions, write_json, written_whole
+from neuroprior._files import quote_frame, versions, write_json, written_whole
 from neuroprior._folders import claim
 from neuroprior._statistics import ENOUGH_UNITS, Difference, holm, ratio_difference
 from neuroprior.comparison.contestants import BASELINE
@@ -206,7 +206,7 @@ class Comparison:
         with claim(folder, replaces=True) as place:
             place.add([f"comparison.{ending}" for ending in ("csv", "png", "json")])
             with written_whole(folder / "comparison.csv") as file:
-                frame.to_csv(file, index=False)
+                quote_frame(frame).to_csv(file, index=False)
             with written_whole(folder / "comparison.png", "wb") as file:
                 figure.savefig(file, format="png", dpi=150)
             write_json(folder / "comparison.json", content)

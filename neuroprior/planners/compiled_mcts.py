@@ -19,6 +19,7 @@ from neuroprior.priors.counts.history_prior import HistoryPrior
 from neuroprior.priors.neural.compiled_gru import BLOCK, Network, advance, on_one_thread
 from neuroprior.priors.neural.gru import GRUPrior
 from neuroprior.priors.uniform import UniformPrior
+from neuroprior.sampling.draws import check_possible
 from neuroprior.sampling.stepping import Steppable, Stepper
 from neuroprior.worlds.tabular import TabularWorld
 from neuroprior.worlds.world import World
@@ -500,8 +501,8 @@ def _search_all(
     batch, actions, length = len(state), world.num_actions, planner.length
     steps = planner.num_plans * length
     policy = policy_of(planner.prior, world, planner.temperature)
-    if any(np.isnan(part).any() for part in (policy.probs, policy.by_context, *policy.network)):
-        raise ValueError("prior: its logits are NaN")
+    parts = policy.probs, policy.by_context, *policy.network
+    check_possible(not any(np.isnan(part).any() for part in parts))
     logits, hidden = Stepper(planner.prior).start_in(world, state)
     (layers, size, _), most = policy.network.recurrent.shape, batch * length * (1 + actions)
     room, number = max(min(DRAWS // most, 2 * planner.num_plans), 1), 0
@@ -638,11 +639,8 @@ def _knows(prior: Steppable) -> bool:
         return True
     if isinstance(prior, HistoryPrior):
         own = type(prior)
-        same = own.start is HistoryPrior.start and own.step is HistoryPrior.step and own._at is HistoryPrior._at
-        return same and prior.log_probs.dtype == torch.float32
-    if not isinstance(prior, GRUPrior) or prior.training or not prior.is_plain:
-        return False
-    return prior.head.weight.dtype == torch.float32
+        return own.start is HistoryPrior.start and own.step is HistoryPrior.step and own._at is HistoryPrior._at
+    return isinstance(prior, GRUPrior) and not prior.training and prior.is_plain
 
 
 def policy_of(prior: Any, world: TabularWorld, temperature: float) -> Policy:

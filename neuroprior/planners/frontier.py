@@ -18,6 +18,7 @@ from neuroprior.planners.planner import (
     random_best,
 )
 from neuroprior.plans import action_dtype
+from neuroprior.sampling.draws import check_possible
 from neuroprior.sampling.states import select_rows
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
 from neuroprior.worlds.world import World, step_alive
@@ -196,9 +197,8 @@ class _Front(NamedTuple):
 
 def _child_log_probs(log_prob: Tensor, logits: Tensor, temperature: float) -> Tensor:
     """The log-probabilities `[M, A]` of plans of `log_prob [M, 1]` after one more action, by its `logits [M, A]`."""
-    if (logits.isnan() & (log_prob > -torch.inf)).any():
-        raise ValueError("prior: its logits are NaN")
     child = log_prob + (logits.double() / temperature).log_softmax(-1)
+    check_possible(~(child[:, :1].isnan() & (log_prob > -torch.inf)).any())
     # After an impossible prefix a prior may give NaN.
     return torch.where(log_prob > -torch.inf, child, -torch.inf)
 

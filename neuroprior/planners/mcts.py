@@ -7,7 +7,7 @@ from torch import Tensor
 
 from neuroprior._checks import is_number
 from neuroprior.planners.planner import Decision, Objective, PriorPlanner, decide, join_decisions
-from neuroprior.sampling.draws import Draw
+from neuroprior.sampling.draws import Draw, check_possible
 from neuroprior.sampling.states import State, StateStore, join_rows, numbers_in, select_rows
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
 from neuroprior.worlds.tabular import TabularWorld
@@ -260,18 +260,15 @@ class _Trees:
 
     def _legal(self, state: Tensor, logits: Tensor) -> Tensor:
         """`logits [N, A]`, -inf for actions that are not legal in `state [N, ...]`."""
-        logits = legal_logits(self.world, state, logits)
-        if not self.world.all_legal and (logits == -torch.inf).all(1).any():
-            raise ValueError("prior: in some state all legal actions have probability 0")
-        if logits.isnan().any():
-            raise ValueError("prior: its logits are NaN")
-        return logits
+        return legal_logits(self.world, state, logits)
 
     def _keep(self, rows: Tensor, node: Tensor, depth: int, logits: Tensor, hidden: State) -> None:
         """Keep what the prior predicts at new nodes `[K]`, and its states."""
         if len(rows) == 0:
             return
-        self.probs[rows, node] = (logits.double() / self.planner.temperature).softmax(-1).cpu()
+        probs = (logits.double() / self.planner.temperature).softmax(-1).cpu()
+        check_possible(~probs[:, 0].isnan().any())
+        self.probs[rows, node] = probs
         if not self.world.all_legal:
             state = self.state[rows.to(self.device), node.to(self.device)]
             self.closed[rows, node] = ~allowed_actions(self.world, state).cpu()

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neuroprior._checks import check_single_precision, is_whole, warn_caller
-from neuroprior._files import MISSING_LABELS
+from neuroprior._checks import check_memory, check_single_precision, is_whole, warn_caller
+from neuroprior._files import MISSING_LABELS, unquote_cell
 
 Integers = NDArray[np.integer[Any]]
 Floats = NDArray[np.floating[Any]]
@@ -18,8 +18,11 @@ Names = tuple[str, ...]
 Place = Callable[[int], str]
 """Where an entry stands: its position among all the entries to "FILE, line N"."""
 
-MOST_ENTRIES = 2**33
-"""Entries of padded plans beyond which a file is refused."""
+MOST_COUNTED = 2**16
+"""The most actions that are counted by the largest number among them."""
+
+MAX_GROWTH, SMALL_BYTES = 100, 2**28
+"""Data that take more memory than this many times what they hold are refused, unless they take few bytes."""
 
 LARGEST_INTEGER = 2**62
 LARGEST_FLOAT = float(np.finfo(np.float32).max)
@@ -116,7 +119,7 @@ class Column(dict[str, int]):
 
     def __missing__(self, text: str) -> int:
         """Number a new text; ValueError (which does not know the line) for one that is neither a number nor a name."""
-        label = text.strip() if self.untyped else text
+        label = unquote_cell(text.strip()) if self.untyped else text
         if self.blank and is_missing(label) and label not in (self.names or ()):
             number = -1
         else:
@@ -271,6 +274,25 @@ def check_names(num_actions: int | None, action_names: Sequence[str] | None) -> 
     return names
 
 
+def grows_too_much(needed: int, held: int) -> bool:
+    """Whether data of `held` bytes, or in a file of so many, must not take `needed` bytes of memory."""
+    return needed > max(MAX_GROWTH * held, SMALL_BYTES)
+
+
+def count_up_to(largest: int) -> int:
+    """How many actions there are if nothing but the largest number among them says so.
+
+    Raises:
+        ValueError: it is too large to be taken for one of as many; it may be a time, or the number of an animal.
+    """
+    if largest >= MOST_COUNTED:
+        raise ValueError(
+            f"`actions` must be below {MOST_COUNTED} where nothing says how many there are, got {largest}; give"
+            " num_actions or action_names"
+        )
+    return largest + 1
+
+
 def as_single(name: str, features: NDArray[Any]) -> NDArray[np.float32]:
     """Features `[N, C]` as float32; ValueError where these would not hold how they vary."""
     check_single_precision(name, torch.from_numpy(features))
@@ -278,15 +300,17 @@ def as_single(name: str, features: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def padded(values: NDArray[Any], lengths: Integers, source: str) -> NDArray[Any]:
-    """`[N, L, ...]` of values `[S, ...]`, zero after the end of a plan; ValueError if these are too many entries."""
+    """`[N, L, ...]` of values `[S, ...]`, zero after the end of a plan; ValueError where nearly all would be zeros."""
     longest = int(lengths.max()) if len(lengths) else 0
     shape = (len(lengths), longest, *values.shape[1:])
-    entries = len(lengths) * longest * int(np.prod(values.shape[1:]))
-    if entries > MOST_ENTRIES:
+    needed = len(lengths) * longest * (values.nbytes // max(len(values), 1))
+    if grows_too_much(needed, values.nbytes):
         raise ValueError(
-            f"{source}: {len(lengths)} plans padded to the longest, plan {int(lengths.argmax()) + 1} of {longest} "
-            f"actions, are {entries} entries, more than {MOST_ENTRIES}; cut long plans in pieces"
+            f"{source}: {len(lengths):,} plans with {len(values):,} actions would take {needed:,} bytes, padded to the"
+            f" longest, plan {int(lengths.argmax()) + 1} of {longest:,} actions; cut it into several plans, or keep it"
+            " in a file of its own"
         )
+    check_memory(needed, plans=f"{len(lengths):,} of up to {longest:,} actions")
     if len(values) == len(lengths) * longest:
         return values.reshape(shape)
     wide = np.zeros(shape, values.dtype)

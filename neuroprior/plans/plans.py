@@ -97,6 +97,7 @@ class Plans(Sequences):
         if self.context is not None:
             context = as_numbers("context", self.context)
             check_context(context, num, length)
+            context = as_single(context)
             context = context.to(torch.int32) if has_patterns(context) else self._context_of_steps(context)
             object.__setattr__(self, "context", context)
         check_distinct("action_names", self.action_names)
@@ -295,14 +296,19 @@ def check_patterns(patterns: Tensor) -> None:
 
 
 def as_numbers(name: str, values: Any) -> Tensor:
-    """Numbers as a tensor; ValueError for names, and for rows of unequal lengths."""
+    """Numbers as a tensor without gradients; ValueError for names, and for rows of unequal lengths."""
     try:
-        return torch.as_tensor(values)
+        return torch.as_tensor(values).detach()
     except (RuntimeError, TypeError, ValueError):
         raise ValueError(
             f"`{name}` must be numbers in rows of one length (names go into {name.removesuffix('s')}_names, and how"
             " long each plan is into lengths)"
         ) from None
+
+
+def as_single(values: Tensor) -> Tensor:
+    """Numbers in half precision in single precision, in which priors compute; others as they are."""
+    return values.float() if values.is_floating_point() and values.dtype.itemsize < 4 else values
 
 
 def as_integers(name: str, values: Any, num: int) -> Tensor:

@@ -10,17 +10,32 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_count, is_integer, is_number
+from neuroprior._checks import check_count, describe, is_integer, is_number
 from neuroprior._random import generator_on
 
 
-def check_index(index: object) -> None:
-    """Raise IndexError for the number of a single plan, which would not be plans."""
+def as_index(index: Any, num: int) -> Tensor | slice:
+    """Returns a slice, or which of `num` plans are meant: int64 `[M]`, or a bool mask `[num]`.
+
+    Raises:
+        IndexError: the number of a single plan, which would not be plans; what is out of range; or no index.
+    """
+    if isinstance(index, slice):
+        return index
     if isinstance(index, Integral) or getattr(index, "ndim", None) == 0:
-        number = int(index)  # type: ignore[call-overload]
+        number = int(index)
         raise IndexError(
             f"`plans` must be indexed by a slice or a tensor; plans[{number} : {number + 1 or ''}] is one plan"
         )
+    given = torch.as_tensor(index)
+    given = given.long() if is_integer(given) or not given.numel() else given
+    mask = given.dtype == torch.bool
+    if given.dim() != 1 or not (mask or is_integer(given)) or (mask and len(given) != num):
+        raise IndexError(f"`plans` must be indexed by a slice, integers [M] or bool [{num}], got {describe(given)}")
+    wrong = given[:0] if mask else given[(given < -num) | (given >= num)]
+    if len(wrong):
+        raise IndexError(f"`plans` must be indexed by integers from 0 to {num - 1}, got {int(wrong[0])}")
+    return given
 
 
 class Sequences(ABC):
@@ -78,7 +93,7 @@ class Sequences(ABC):
 
     def __getitem__(self, index: Tensor | slice) -> Self:
         """The plans at `index` (a slice, integers or a bool mask)."""
-        check_index(index)
+        index = as_index(index, len(self))
         return replace(self, **self.select_rows((*self.PER_PLAN, *self.PER_ACTION), index))  # type: ignore[type-var]
 
     def select_rows(self, names: Sequence[str], index: Tensor | slice) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from neuroprior.priors.learning import (
 )
 from neuroprior.priors.prior import Prior
 from neuroprior.sampling.states import State
+from neuroprior.sampling.stepping import check_outputs
 
 START_CONCENTRATIONS = (1.0, 10.0, 100.0)
 """From these the likeliest concentrations are searched."""
@@ -127,13 +128,15 @@ class AdaptivePrior(Prior):
         return self.base.fit_settings
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, State]:
-        logits, state = self.base.start(batch_size, context)
+        outputs = self.base.start(batch_size, context)
+        logits, state = check_outputs(outputs, batch_size, self.num_actions, "start")
         before = torch.zeros(batch_size, 0, dtype=torch.long, device=logits.device)
         return self._adapt(logits[:, None], before, 0)[:, 0], (before, state)
 
     def step(self, action: Tensor, state: State, context: Tensor | None = None) -> tuple[Tensor, State]:
         before, inner = state
-        logits, inner = self.base.step(action, inner, context)
+        outputs = self.base.step(action, inner, context)
+        logits, inner = check_outputs(outputs, len(action), self.num_actions, "step")
         before = torch.cat([before, action.long()[:, None]], 1)
         return self._adapt(logits[:, None], before, before.shape[1])[:, 0], (before, inner)
 

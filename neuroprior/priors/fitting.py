@@ -9,6 +9,7 @@ from torch import Tensor
 
 from neuroprior._registry import Registry
 from neuroprior.plans import Plans
+from neuroprior.plans.columns import count_up_to
 from neuroprior.plans.sequences import Sequences
 from neuroprior.priors.adaptive import AdaptivePrior
 from neuroprior.priors.construction import construct, context_arguments
@@ -67,7 +68,7 @@ def fit(
         raise ValueError(f"`plans` must be Plans of numbered actions, got {type(given).__name__}")
     if not isinstance(plans, Plans):
         actions = as_actions(plans)
-        plans = Plans(actions, int(actions.max()) + 1 if actions.numel() else 1)
+        plans = Plans(actions, count_up_to(int(actions.max())) if actions.numel() else 1)
     if not plans.mask().any():
         raise ValueError(f"`plans` must have at least one action to learn from; these {len(plans)} have none")
     if isinstance(prior, str):

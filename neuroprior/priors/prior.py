@@ -7,12 +7,13 @@ from typing import Any, ClassVar, Literal, Self
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_range, check_same_names, check_sizes, is_integer, kind_of
+from neuroprior._checks import check_memory, check_range, check_same_names, check_sizes, describe, is_integer, kind_of
 from neuroprior.plans import Plans, check_context, check_patterns, has_patterns
-from neuroprior.plans.sequences import is_per_plan
+from neuroprior.plans.sequences import expand_context, is_per_plan
 from neuroprior.priors.saved import SavedModule
 from neuroprior.sampling import ancestral as sampling
-from neuroprior.sampling.draws import after_end
+from neuroprior.sampling.draws import after_end, check_possible
+from neuroprior.sampling.stepping import check_logits, check_outputs
 
 
 class Prior(SavedModule):
@@ -196,20 +197,36 @@ class Prior(SavedModule):
             context: None, or `[N, L]`, `[N, L, C]` or `[N, L, F]`.
 
         Returns:
-            Logits `[N, L, A]`, equal to those that stepping gives. This default steps. Plans are not checked here,
-            but in `forecasts`, `log_prob` and `action_log_probs`.
+            Logits `[N, L, A]`, equal to those that stepping gives. This default steps. Plans are checked where the
+            prior is called, `prior(plans, context)`.
         """
         num, length = plans.shape
         if length == 0:
             return torch.zeros(num, 0, self.num_actions, device=self.device)
         out = []
-        logits, state = self.start(num, None if context is None else context[:, 0])
+        outputs = self.start(num, None if context is None else context[:, 0])
         for t in range(length):
+            logits, state = check_outputs(outputs, num, self.num_actions, "step" if t else "start")
             out.append(logits)
             if t + 1 < length:
                 now = None if context is None else context[:, t + 1]
-                logits, state = self.step(plans[:, t].long(), state, now)
+                outputs = self.step(plans[:, t].long(), state, now)
         return torch.stack(out, 1)
+
+    def __call__(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
+        """As `forward`, which it calls; a context given once a plan, `[N]` or `[N, C]`, is that of all of its steps.
+
+        Raises:
+            ValueError: other actions or another context than this prior's, or `forward` returns other logits.
+        """
+        plans = as_actions(plans)
+        if plans.dim() != 2:
+            raise ValueError(f"`plans` must be integers [N, L], got {describe(plans)}")
+        if plans.device.type == "cpu":  # as in `check_step`
+            check_range("plans", plans, self.num_actions, "actions")
+            self.check_context_of(context, *plans.shape)
+        context = None if context is None else expand_context(context, plans.shape[1])
+        return check_logits(super().__call__(plans, context), [*plans.shape, self.num_actions], "forward")
 
     def log_prob(self, plans: Plans | Tensor) -> Tensor:
         """The log-probability of plans.
@@ -235,7 +252,8 @@ class Prior(SavedModule):
             `[N, L]`, nats; 0 beyond a plan's end.
 
         Raises:
-            ValueError: other actions or another context than this prior's.
+            ValueError: other actions or another context than this prior's; or NaN for its logits, or -inf for all, at a
+                step that is reached.
         """
         plans = self.as_plans(plans)
         if plans.actions.numel() == 0:
@@ -243,8 +261,12 @@ class Prior(SavedModule):
             return torch.zeros(plans.actions.shape, device=self.device)
         parts = []
         for part, log_probs in self.forecasts(plans):
-            taken = log_probs.gather(-1, part.actions.long()[..., None])[..., 0]
-            parts.append(taken.masked_fill(~part.mask(), 0))
+            taken = log_probs.gather(-1, part.actions.long()[..., None])[..., 0].masked_fill(~part.mask(), 0)
+            unknown = taken.isnan()
+            if unknown.any():  # which a prior may give after an impossible action
+                possible = (taken == -torch.inf).cumsum(1) == 0
+                check_possible(not (unknown & possible).any())
+            parts.append(taken.masked_fill(unknown, 0))
         return torch.cat(parts)
 
     def forecasts(self, plans: Plans) -> Iterator[tuple[Plans, Tensor]]:
@@ -356,6 +378,8 @@ class Prior(SavedModule):
         """
         if action.device.type != "cpu":
             return
+        if action.dim() != 1:
+            raise ValueError(f"`action` must be integers [N], got {describe(action)}")
         check_range("action", action, self.num_actions, "actions")
         if context is not None:
             self.check_context_of(context, len(action))

@@ -2,8 +2,8 @@
 
 import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -47,6 +47,22 @@ class SavedModule(nn.Module, ABC):
     def tables_fit(self) -> bool:
         """Whether the `tables` are those of a module of this kind; checks what was read from a file."""
         return True
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """What `nn.Module` moves a module by; also refuses another precision, in which not every prior computes."""
+        dtype = fn(torch.zeros(0, dtype=torch.float32)).dtype
+        if dtype != torch.float32:
+            raise ValueError(
+                f"priors must compute in single precision, torch.float32, got {dtype}; on a GPU torch.autocast may do"
+                " with less"
+            )
+
+        def move(values: Tensor) -> Tensor:
+            moved = fn(values)
+            return moved if moved.dtype == values.dtype else values.to(moved.device)  # counts are float64
+
+        applied: Self = super()._apply(move, recurse)
+        return applied
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
         for name in self.tables:

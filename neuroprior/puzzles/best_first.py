@@ -15,7 +15,7 @@ from neuroprior.plans import action_dtype
 from neuroprior.priors.uniform import UniformPrior
 from neuroprior.puzzles.compiled_search import ADDITIVE, LEVIN, can_search, compiled_tables, search_all
 from neuroprior.puzzles.worlds.puzzle import PuzzleWorld
-from neuroprior.sampling.draws import check_temperature
+from neuroprior.sampling.draws import check_possible, check_temperature
 from neuroprior.sampling.states import State, StateStore, tensors_in
 from neuroprior.sampling.stepping import Steppable, Stepper, check_in_world
 from neuroprior.worlds.world import World
@@ -342,8 +342,7 @@ class _Trees:
         if bool((self.size > self.capacity).any()):
             self._grow()
         own = torch.log_softmax(logits.double() / self.planner.temperature, -1)
-        if bool(own.isnan().any()):
-            raise ValueError("`prior` must have logits that are numbers, got NaN.")
+        check_possible(~own[:, 0].isnan().any())
         legal = self.world.legal_actions(state) & ~self.world.terminated(state)[:, None]
         left, of_children = self._left(tree, state, legal)
         if self.lower_bound is not None:

@@ -30,6 +30,7 @@ from neuroprior.puzzles.worlds.rules import (
 )
 from neuroprior.puzzles.worlds.sliding_tiles import SlidingTilesWorld
 from neuroprior.puzzles.worlds.sokoban import SokobanWorld
+from neuroprior.sampling.draws import check_possible
 from neuroprior.worlds.world import World
 
 LONGEST = 4096
@@ -267,7 +268,7 @@ def can_search(world: World, prior: Any) -> bool:
     if type(world) not in (SokobanWorld, SlidingTilesWorld) or not isinstance(world, PuzzleWorld):
         return False
     patterned = type(prior) is LogLinearPrior and prior.num_patterns == len(world.windows.windows)
-    return world.device.type == "cpu" and (patterned or isinstance(prior, UniformPrior))
+    return world.device.type == "cpu" and (patterned or type(prior) is UniformPrior)
 
 
 def compiled_tables(prior: Any, temperature: float) -> Tables:
@@ -276,8 +277,7 @@ def compiled_tables(prior: Any, temperature: float) -> Tables:
         codes, weights, after = np.zeros(0), np.zeros((0, ACTIONS)), np.zeros((ACTIONS + 1, ACTIONS))
     else:
         codes, weights, after = prior.patterns.numpy(), prior.weights[:-1].numpy(), prior.after.numpy()
-    if np.isnan(weights).any() or np.isnan(after).any():
-        raise ValueError("`prior` must have weights that are numbers, got NaN.")
+    check_possible(not (np.isnan(weights).any() or np.isnan(after).any()))
     placed = hash_table(codes.astype(np.int64), (weights / temperature).astype(np.float32))
     return Tables(*placed, (after / temperature).astype(np.float32))
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from neuroprior._checks import check_count, check_memory, check_range, check_sizes, describe, is_integer
 from neuroprior._random import generator_on
 from neuroprior._threads import share
-from neuroprior.plans.plans import action_dtype
+from neuroprior.plans.plans import action_dtype, as_single
 from neuroprior.plans.sequences import is_per_plan
 from neuroprior.sampling.draws import (
     Draw,
@@ -21,7 +21,7 @@ from neuroprior.sampling.draws import (
 )
 from neuroprior.sampling.prefixes import Prefixes
 from neuroprior.sampling.states import State, map_state, numbers_in, select_rows
-from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
+from neuroprior.sampling.stepping import Steppable, Stepper, check_outputs, legal_logits
 from neuroprior.worlds.world import Rollout, World, join_states, step_alive
 
 Mask: TypeAlias = Callable[[Tensor], Any]
@@ -97,7 +97,7 @@ def sample(
     check_memory((each * num_plans + 4 * min(num_plans, batch_size)) * length, num_plans=num_plans, length=length)
     stepper = Stepper(prior)
     device = stepper.device
-    context = None if context is None else torch.as_tensor(context, device=device)
+    context = None if context is None else as_single(torch.as_tensor(context, device=device).detach())
     if method not in ("auto", "ancestral", "tree"):
         raise ValueError(f'`method` must be "auto", "ancestral" or "tree", got {method!r}')
     if context is not None and context.shape[0] != num_plans:
@@ -317,16 +317,14 @@ def _checked_state(state: tuple[Tensor, State], num_plans: int, num_actions: int
     Raises:
         ValueError: it is none.
     """
-    try:
-        logits, hidden = state
-        rows, columns = logits.shape
-    except (TypeError, ValueError, AttributeError):
-        raise ValueError("`state` must be what `start` or `step` returned, logits [N, A] and a state") from None
-    if columns != num_actions or rows not in (1, num_plans):
+    shape = list(getattr(state[0], "shape", [])) if isinstance(state, tuple) and state else []
+    if len(shape) != 2:
+        raise ValueError("`state` must be what `start` or `step` returned, logits [N, A] and a state")
+    if shape[1] != num_actions or shape[0] not in (1, num_plans):
         raise ValueError(
-            f"`state` must be of 1 row or of num_plans = {num_plans}, with {num_actions} logits each,"
-            f" got {[rows, columns]}"
+            f"`state` must be of 1 row or of num_plans = {num_plans}, with {num_actions} logits each, got {shape}"
         )
+    logits, hidden = check_outputs(state, shape[0], num_actions, "step")
     return logits, map_state(torch.clone, hidden)
 
 

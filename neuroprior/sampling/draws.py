@@ -94,10 +94,11 @@ class Draw:
         return torch.stack(parts, -1).long()
 
 
-def check_possible(possible: Tensor) -> None:
-    """Raise ValueError unless it is `possible`, a bool `[]`, to draw actions.
+def check_possible(possible: Tensor | bool) -> None:
+    """Raise ValueError unless it is `possible`, a bool (`[]`), to draw actions.
 
-    That is where the sums of the weights of all actions are positive; they are NaN where a logit is.
+    That is where the sums of the weights of all actions are positive; they are NaN where a logit is, and so are the
+    log-probabilities of all actions.
     """
     if not possible:
         raise ValueError("prior: its logits are NaN or infinite, or -inf for all legal actions of a state")

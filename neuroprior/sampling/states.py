@@ -6,6 +6,7 @@ from typing import Any, TypeAlias
 import torch
 from torch import Tensor
 
+from neuroprior._checks import describe, is_integer
 from neuroprior.sampling.rows import rows_of
 
 State: TypeAlias = Any
@@ -33,6 +34,10 @@ def select_rows(state: State, row: Tensor | slice) -> State:
     """
     if isinstance(row, slice):
         return map_state(lambda values: values[row], state)
+    if row.dtype not in (torch.int32, torch.int64):  # the only ones that torch selects by
+        if not is_integer(row):
+            raise ValueError(f"`row` must be integers [M] or a slice, got {describe(row)}")
+        row = row.long()
     return map_state(lambda values: rows_of(values, row), state)
 
 
@@ -44,6 +49,13 @@ def join_rows(*states: State) -> State:
 def tensors_in(state: State) -> list[Tensor]:
     """Returns all tensors of a state, in order."""
     return [state] if isinstance(state, Tensor) else [values for part in state for values in tensors_in(part)]
+
+
+def has_rows(state: State, num: int) -> bool:
+    """Returns whether a state is one of `num` plans: a tensor of so many rows, or a tuple of such states."""
+    if isinstance(state, tuple):
+        return len(state) > 0 and all(has_rows(part, num) for part in state)
+    return isinstance(state, Tensor) and state.dim() > 0 and len(state) == num
 
 
 def numbers_in(state: State) -> int:

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from neuroprior._checks import check_same_names, describe, is_integer
 from neuroprior._threads import one_thread
+from neuroprior.plans.plans import as_single
 from neuroprior.sampling.draws import Draw, after_end, are_few
-from neuroprior.sampling.states import State
+from neuroprior.sampling.states import State, has_rows
 from neuroprior.worlds.world import World, allowed_actions, check_is_world
 
 FEWEST_TO_SHARE = 256
@@ -119,22 +120,20 @@ class Stepper:
             ValueError: the prior gives other logits.
         """
         with self.threads_for(batch_size):
-            logits, state = self._prior.start(batch_size) if context is None else self._prior.start(batch_size, context)
-        due = [batch_size, self.num_actions]
-        if not isinstance(logits, Tensor) or not logits.is_floating_point() or list(logits.shape) != due:
-            raise ValueError(f"`prior` must start with floating point logits {due}, got {describe(logits)}")
-        return logits, state
+            outputs = self._prior.start(batch_size) if context is None else self._prior.start(batch_size, context)
+        return check_outputs(outputs, batch_size, self.num_actions, "start")
 
     def step(self, action: Tensor, state: State, context: Tensor | None = None) -> tuple[Tensor, State]:
         """Logits `[N, A]` of the next action, and the next state.
 
         After the end symbol nothing else has a probability above 0.
+
+        Raises:
+            ValueError: the prior gives other logits.
         """
         with self.threads_for(len(action)):
-            if context is None:
-                logits, state = self._prior.step(action, state)
-            else:
-                logits, state = self._prior.step(action, state, context)
+            outputs = self._prior.step(action, state, *(() if context is None else (context,)))
+        logits, state = check_outputs(outputs, len(action), self.num_actions, "step")
         return after_end(logits, action, self.end), state
 
     def draw_rest(self, action: Tensor, state: State, uniform: Tensor, temperature: float) -> Tensor | None:
@@ -166,9 +165,37 @@ class Stepper:
             pair, row = (reached * self.num_actions + action).unique(return_inverse=True)
             context, action = world.context(pair // self.num_actions), pair % self.num_actions
             with self.threads_for(len(row)):
-                logits, state = self._step_shared(action, state, context, row)
-            return logits, state
+                outputs = self._step_shared(action, state, context, row)
+            return check_outputs(outputs, len(row), self.num_actions, "step_shared")
         return self.step(action, state, world.context(reached) if self.context_per == "step" else None)
+
+
+def check_outputs(outputs: Any, num_plans: int, num_actions: int, method: str) -> tuple[Tensor, State]:
+    """Logits `[N, A]` and the state that a prior's `method` returned; logits in half precision as float32.
+
+    Raises:
+        ValueError: they are none, or of another number of plans or actions.
+    """
+    if not isinstance(outputs, tuple) or len(outputs) != 2:
+        raise ValueError(f"prior: `{method}` must return logits and a state, got {describe(outputs)}")
+    logits, state = outputs
+    if not has_rows(state, num_plans):
+        raise ValueError(
+            f"prior: `{method}` must return a state of {num_plans} rows, a tensor or a tuple of such tensors, got"
+            f" {describe(state)}"
+        )
+    return check_logits(logits, [num_plans, num_actions], method), state
+
+
+def check_logits(logits: Any, shape: list[int], method: str) -> Tensor:
+    """The logits that a prior's `method` returned; those in half precision as float32, in which they are summed.
+
+    Raises:
+        ValueError: they are no floating point tensor of this shape.
+    """
+    if not isinstance(logits, Tensor) or not logits.is_floating_point() or list(logits.shape) != shape:
+        raise ValueError(f"prior: `{method}` must return floating point logits {shape}, got {describe(logits)}")
+    return as_single(logits)
 
 
 def _numbered(reached: Tensor) -> bool:

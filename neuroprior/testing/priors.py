@@ -8,24 +8,25 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from neuroprior._checks import describe, kind_of
+from neuroprior._checks import kind_of
 from neuroprior.plans import Plans, all_plans
 from neuroprior.priors import Prior, load, save
 from neuroprior.sampling.ancestral import sample
 from neuroprior.sampling.states import map_state, select_rows, tensors_in
+from neuroprior.sampling.stepping import check_outputs
 from neuroprior.testing.chi_square import chi_square
-from neuroprior.testing.rules import FALSE_ALARM, PRIOR_CHECKS, check_by_kind, raises, require
+from neuroprior.testing.rules import FALSE_ALARM, PRIOR_CHECKS, check_by_kind, raises, require, unless_refused
 
 
 def check_prior(prior: Any, length: int | None = None, num_plans: int = 20_000, seed: int = 0) -> None:
     """Raise AssertionError, with a message that says how, unless `prior` does what a prior must.
 
     `fit` returns the prior (tried of those without settings), and `step` leaves the state that it is given as it is.
-    With each kind of context that it takes: stepping equals `forward`, also past its window and after states were
-    reordered, and `advance` equals stepping; `log_prob` sums to one over all plans of a length and fits what `sample`
-    draws, by prefix tree and plan by plan (chi-square tests, each with a false alarm of 1e-6); the same seed gives the
-    same plans and torch's global generator is left alone; saving and loading, and moving to a GPU where there is one,
-    change nothing.
+    With each kind of context that it takes: stepping equals `forward`, also past its window; rows of a state taken
+    alone, in another order, predict what they predict among all; `log_prob` sums to one over all plans of a length and
+    fits what `sample` draws, by prefix tree and plan by plan (chi-square tests, each with a false alarm of 1e-6); the
+    same seed gives the same plans and torch's global generator is left alone; saving and loading, and moving to a GPU
+    where there is one, change nothing.
 
     A prior over vectors is checked by `neuroprior.control.check_vector_prior`.
 
@@ -89,19 +90,12 @@ def _random_context(
 @torch.no_grad()
 def _check_outputs(prior: Prior, plans: Tensor, context: Tensor | None) -> None:
     """`start` and `step` return floating point logits `[N, A]` and a state, and leave the state before as it is."""
-    due, given = [len(plans), prior.num_actions], _at(context, 0)
+    given = _at(context, 0)
     state: Any = None
     kept: Any = None
     for method in ("start", "step"):
-        result = prior.start(len(plans), given) if method == "start" else prior.step(plans[:, 0], state, given)
-        require(isinstance(result, tuple) and len(result) == 2, f"{method} must return logits and a state")
-        logits, after = result
-        right = isinstance(logits, Tensor) and logits.is_floating_point() and list(logits.shape) == due
-        require(right, f"{method} must return floating point logits {due}, got {describe(logits)}")
-        require(
-            _has_rows(after, len(plans)),
-            f"{method}: state must be a tensor of {len(plans)} rows, or a tuple of such tensors, got {describe(after)}",
-        )
+        outputs = prior.start(len(plans), given) if method == "start" else prior.step(plans[:, 0], state, given)
+        _, after = unless_refused(partial(check_outputs, outputs, len(plans), prior.num_actions, method))
         if kept is not None:
             same = all(map(torch.equal, tensors_in(kept), tensors_in(state)))
             require(same, "step must leave the state that it is given as it is, and return another")
@@ -123,7 +117,7 @@ def _check_fit(prior: Prior, length: int, generator: torch.Generator) -> None:
 
 @torch.no_grad()
 def _check_stepping(prior: Prior, plans: Tensor, context: Tensor | None, stays: bool) -> None:
-    """`start` and `step` give what `forward` gives; reordering the state reorders the logits."""
+    """`start` and `step` give what `forward` gives; some rows, reordered, have the logits that they have among all."""
     num, length = plans.shape
     if stays:
         _, state = prior.start(num, _at(context, 0))
@@ -134,29 +128,33 @@ def _check_stepping(prior: Prior, plans: Tensor, context: Tensor | None, stays: 
                 f"step: {error}; `step` is given None where the last context goes on: what is needed later has to be"
                 " kept in the state"
             ) from error
-    whole = prior(plans, context)
+    whole = unless_refused(partial(prior, plans, context))
     # On a GPU cuDNN reads sequences with 10 bits of mantissa (TF32), unless that is switched off.
     rounding = 1e-4 if plans.device.type == "cpu" else 1e-3
-    shape = (num, length, prior.num_actions)
-    require(whole.shape == shape, f"forward: logits {list(whole.shape)}, not {list(shape)}")
     require(not whole.isnan().any(), "forward: NaN in the logits")
     whole = whole.log_softmax(-1)
     given = _at(context, 0)
     logits, state = prior.start(num, given)
-    order = torch.arange(num - 1, -1, -1, device=plans.device)
+    some = torch.arange(num - 1, -1, -2, device=plans.device)
+    gap = _largest_gap(prior(plans[some], None if context is None else context[some]), whole[some])
+    require(gap < rounding, f"forward: the logits of a plan change by {gap:.2g} nats with the plans beside it")
     for t in range(length):
         kind = "no context" if context is None else f"context {list(context.shape)}"
         where = f"plans of length {length}, action {t}, {kind}"
-        gap = float((logits.log_softmax(-1) - whole[:, t]).abs().nan_to_num(0).max())
+        gap = _largest_gap(logits, whole[:, t])
         require(gap < rounding, f"stepping differs from forward by {gap:.2g} nats ({where})")
         if t + 1 < length:
             given = None if stays else _at(context, t + 1)
-            backwards, _ = prior.step(
-                plans[order, t], select_rows(state, order), None if given is None else given[order]
-            )
+            few, _ = prior.step(plans[some, t], select_rows(state, some), None if given is None else given[some])
             logits, state = prior.step(plans[:, t], state, given)
-            gap = float((backwards[order] - logits).abs().nan_to_num(0).max())
-            require(gap < rounding, f"reordering the state changes the logits by {gap:.2g} ({where})")
+            gap = _largest_gap(few, logits[some])
+            message = f"step: the logits of a plan change by {gap:.2g} nats with the plans beside it ({where})"
+            require(gap < rounding, message)
+
+
+def _largest_gap(logits: Tensor, others: Tensor) -> float:
+    """The largest difference of two log-probabilities."""
+    return float((logits.log_softmax(-1) - others.log_softmax(-1)).abs().nan_to_num(0).max())
 
 
 def _check_refusals(prior: Prior, generator: torch.Generator) -> None:
@@ -177,12 +175,6 @@ def _check_refusals(prior: Prior, generator: torch.Generator) -> None:
         right = torch.zeros(3, dtype=torch.long, device=prior.device)
         refused = raises(partial(prior.step, right, state, unknown))
         require(refused, "step must raise ValueError for an unknown context")
-
-
-def _has_rows(state: object, num: int) -> bool:
-    if isinstance(state, tuple):
-        return len(state) > 0 and all(_has_rows(part, num) for part in state)
-    return isinstance(state, Tensor) and state.dim() > 0 and len(state) == num
 
 
 def _at(context: Tensor | None, t: int) -> Tensor | None:

@@ -1,7 +1,7 @@
 """What the conformance suites share."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -14,6 +14,8 @@ PRIOR_CHECKS: Registry[tuple[type, Check]] = Registry()
 WORLD_CHECKS: Registry[tuple[type, Check]] = Registry()
 """Conformance suites of priors and worlds of other kinds that wings add: the class, and its suite. It takes the object,
 the length of plans (None: the suite's choice), a number of samples or of states, and a seed."""
+
+Result = TypeVar("Result")
 
 FALSE_ALARM = 1e-6
 """The probability with which correct code fails one of the tests of random draws."""
@@ -37,6 +39,14 @@ def raises(call: Callable[[], object]) -> bool:
     except ValueError:
         return True
     return False
+
+
+def unless_refused(call: Callable[[], Result]) -> Result:
+    """What `call` returns; AssertionError, with its message, where it raises ValueError."""
+    try:
+        return call()
+    except ValueError as error:
+        raise AssertionError(str(error).removeprefix("prior: ")) from error
 
 
 def check_by_kind(

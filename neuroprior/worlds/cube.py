@@ -10,7 +10,7 @@ from torch import Tensor
 from neuroprior._checks import check_count, check_range
 from neuroprior._random import generator_on
 from neuroprior.worlds.observations import Features
-from neuroprior.worlds.world import World
+from neuroprior.worlds.world import World, check_action
 
 FACES = ("U", "R", "F")
 _PERMUTATIONS, _ORIENTATIONS = 5040, 729
@@ -91,7 +91,9 @@ class PocketCube(World):
         return state
 
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-        after = self._after(state, action)
+        if state.device.type == "cpu":
+            self.check_state(state)
+        after = self._after(state, check_action(action, len(state), self.num_actions))
         if self.absorbing:
             ended = state == 0
             after = after.masked_fill(ended, 0)

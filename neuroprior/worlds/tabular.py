@@ -11,7 +11,7 @@ from neuroprior._memory import new_empty
 from neuroprior._random import generator_on
 from neuroprior.worlds.observations import Categories
 from neuroprior.worlds.outcomes import Outcomes
-from neuroprior.worlds.world import Rollout, World, check_plans, join_states
+from neuroprior.worlds.world import Rollout, World, check_action, check_plans, join_states
 
 
 class TabularWorld(World):
@@ -137,6 +137,9 @@ class TabularWorld(World):
         return torch.randint(self.num_maps * self.num_states, (batch_size,), generator=generator, device=self.device)
 
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        if state.device.type == "cpu":
+            self.check_state(state)
+        action = check_action(action, len(state), self.num_actions)
         cell = self.cell(state)
         offset = state - cell
         taken = cell * self.num_actions + action

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple, Self, TypeVar
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_range, is_number, kind_of
+from neuroprior._checks import check_range, describe, is_integer, is_number, kind_of
 from neuroprior.worlds.observations import Observation, as_context
 
 
@@ -243,6 +243,18 @@ def check_plans(plans: Tensor, batch_size: int, num_actions: int) -> None:
             " (for one plan per start, use plans[:, None])"
         )
     check_range("plans", plans, num_actions, "actions")
+
+
+def check_action(action: Tensor, num: int, num_actions: int) -> Tensor:
+    """Returns `action [N]` as int64; raises ValueError unless it is `num` integers below `num_actions`.
+
+    Values are not looked at on a GPU, where that waits for the device.
+    """
+    if not isinstance(action, Tensor) or list(action.shape) != [num] or not is_integer(action):
+        raise ValueError(f"`action` must be integers [{num}], one a state, got {describe(action)}")
+    if action.device.type == "cpu":
+        check_range("action", action, num_actions, "actions")
+    return action.long()
 
 
 def check_objective(objective: str | None, discount: float | None) -> None:

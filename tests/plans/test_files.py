@@ -1,15 +1,20 @@
 """Files of plans: what is written comes back, and what others write is read as they mean it."""
 
+import csv
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import Plans
+from neuroprior._files import quote_cell, unquote_cell
+from neuroprior.behaviour import read
 from neuroprior.behaviour.reporting import ReadOptions
+from neuroprior.behaviour.reporting.document import write_frames
 from neuroprior.plans import expand_context, read_plans, write_plans
 from neuroprior.plans.columns import is_missing, number_in
 
@@ -371,3 +376,39 @@ def test_as_many_features_of_a_plan_as_it_has_actions_are_noted(name, tmp_path):
     assert not read(features[:, :2])
     assert not read(features[:, :, None])
     assert not read(actions)
+
+
+FORMULAS = ("=1+1", "+a", "-x", "@sum(b)", "'=c", "''-d", "-1b", "'tis", "rest")
+
+
+def write_by_plans(plans, path):
+    write_plans(plans, path)
+    return read_plans(path, action_names=plans.action_names)
+
+
+def write_by_report(plans, path):
+    """A table of a report: a row an action."""
+    frame = pd.DataFrame({"behaviour": [plans.action_names[action] for action in plans.actions[0].tolist()]})
+    write_frames(path.parent, {path.stem: frame.assign(time=range(9), subject="=m(7)", **{"=x": -1.5})})
+    return read(path).plans(action_names=plans.action_names)
+
+
+@pytest.mark.parametrize("write", [write_by_plans, write_by_report])
+def test_names_are_no_formulas_in_a_spreadsheet(write, tmp_path):
+    """An apostrophe says so, as spreadsheets have it, and is not read as part of the name."""
+    named = {"action_names": FORMULAS, "context_names": ["@home"], "group_names": ["=m(7)"]}
+    plans = Plans(torch.arange(9)[None], 9, context=torch.tensor([0]), group=torch.tensor([0]), **named)
+    again = write(plans, tmp_path / "a.csv")
+    with open(tmp_path / "a.csv", newline="", encoding="utf-8") as file:
+        cells = {cell for row in csv.reader(file) for cell in row}
+    assert not [cell for cell in cells if cell[0] in "=+@-\t\r" and cell != "-1.5"]
+    assert {"'=1+1", "'-x", "''=c", "'''-d", "'tis", "rest", "'=m(7)"} <= cells
+    assert again.action_names == FORMULAS
+    assert again.actions.equal(plans.actions)
+    assert tuple(again.group_names) == ("=m(7)",)
+    assert again.context is None or tuple(again.context_names) == ("@home",)
+
+
+@pytest.mark.parametrize("cell", ["-1", "+2.5", "-1e-3", "-inf", "-", "1", "", "'", "''", "a=b"])
+def test_numbers_and_other_names_are_written_as_they_are(cell):
+    assert quote_cell(cell) == unquote_cell(cell) == cell

@@ -9,7 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuroprior import Plans
+from neuroprior import Plans, fit
+from neuroprior.behaviour import read
 from neuroprior.control import VectorPlans, vector_plans_from_trajectories
 from neuroprior.plans import from_trajectories, read_plans, write_plans
 from tests.support.sources import refuses
@@ -231,8 +232,55 @@ def test_an_array_alone_is_no_npz(tmp_path):
 
 
 def test_one_long_plan_among_many_short_ones(tmp_path):
-    lines = [f'{{"actions": {[0] * 2**16}}}'] + ['{"actions":[0]}'] * 2**17
-    refused(tmp_path, "a.jsonl", "\n".join(lines), "plan 1 of 65536 actions", f"{(2**17 + 1) * 2**16} entries")
+    """Little data do not become much padding; data of one length may be as large, and few bytes are any data's."""
+    lines = [f'{{"actions": {[0] * 2**16}}}'] + ['{"actions":[0, 1]}'] * 2**13
+    words = "8,193 plans with 81,920 actions", f"{(2**13 + 1) * 2**16:,} bytes", "plan 1 of 65,536 actions; cut it into"
+    refused(tmp_path, "a.jsonl", "\n".join(lines), *words)
+    (tmp_path / "b.jsonl").write_text("\n".join(lines[:300]))
+    assert read_plans(tmp_path / "b.jsonl").actions.shape == (300, 2**16)
+    steps = [np.zeros((2**16 if i == 5 else 1, 300)) for i in range(6)]
+    trajectories = [{"actions": np.zeros(len(some), int), "observations": some} for some in steps]
+    with refuses("trajectories: 1,006 plans", "plan 6 of 65,536 actions"):
+        from_trajectories(trajectories + [trajectories[0]] * 10**3, 1)
+
+
+def test_arrays_that_unpack_to_far_more_than_the_file(tmp_path, monkeypatch):
+    """The sizes that the archive declares are read before anything is unpacked."""
+    monkeypatch.setattr("neuroprior.plans.columns.SMALL_BYTES", 2**20)
+    zeros = np.zeros((2**10, 2**11), np.uint8)
+    np.savez_compressed(tmp_path / "a.npz", actions=zeros[:, : 2**10 + 1])
+    with refuses("a.npz: actions:", f"would unpack to {2**10 * (2**10 + 1) + 128:,}", "np.savez"):
+        read_plans(tmp_path / "a.npz")
+    np.savez_compressed(tmp_path / "b.npz", actions=zeros[:, : 2**9], group=np.arange(2**10))
+    assert len(read_plans(tmp_path / "b.npz")) == 2**10
+    np.savez(tmp_path / "c.npz", actions=zeros)
+    assert read_plans(tmp_path / "c.npz").max_length == 2**11
+
+
+LARGE = np.array([[0, 3], [10**9, 1]])
+
+
+@pytest.mark.parametrize("suffix", [".jsonl", ".csv", ".npz", "array", ".events.csv"])
+def test_a_number_that_is_no_action(suffix, tmp_path):
+    """It is a time or a code, and would make as many actions, unless something says how many there are."""
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".npz":
+        np.savez(path, actions=LARGE)
+    elif suffix == ".jsonl":
+        path.write_text("\n".join(f'{{"actions": {row}}}' for row in LARGE.tolist()))
+    elif suffix == ".events.csv":
+        path.write_text("subject,time,behaviour\n" + "".join(f"m{i % 2},{i},{a}\n" for i, a in enumerate(LARGE.flat)))
+    else:
+        path.write_text("\n".join(",".join(map(str, row)) for row in LARGE.tolist()))
+    calls = {
+        "array": lambda **known: fit(torch.from_numpy(LARGE), "uniform"),
+        ".events.csv": lambda **known: read(path).plans(**known),
+    }
+    call = calls.get(suffix, lambda **known: read_plans(path, **known))
+    with refuses("below 65536 where nothing says how many there are, got 1000000000; give num_actions"):
+        call()
+    if suffix != "array":
+        assert call(num_actions=10**9 + 1).actions.max() == 10**9
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,6 @@ from neuroprior import (
     sample,
     save,
 )
-from neuroprior.priors import StackedPrior
 from neuroprior.priors.learning import training_plans
 from neuroprior.sampling import sample_in_world
 from neuroprior.sampling.states import select_rows, tensors_in
@@ -318,18 +317,6 @@ def test_many_actions():
 
 def test_every_plan_is_numbered_as_written():
     assert every_plan(2, 2).tolist() == [[0, 0], [0, 1], [1, 0], [1, 1]]
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
-@pytest.mark.parametrize("kind", [GRUPrior, TransformerPrior, StackedPrior])
-def test_networks_sample_and_score_in_other_precisions(kind, dtype):
-    plans = torch.randint(4, (20, 6), generator=torch.Generator().manual_seed(0))
-    prior = kind(4).fit(plans, max_steps=3, progress=False)
-    single, step = prior.log_prob(plans), prior.step(plans[:, 0], prior.start(20)[1])[0]
-    prior = prior.to(dtype)
-    assert prior.sample(5, 4, generator=torch.Generator().manual_seed(1)).shape == (5, 4)
-    torch.testing.assert_close(prior.log_prob(plans).float(), single.float(), rtol=0.02, atol=0.05)
-    torch.testing.assert_close(prior.step(plans[:, 0], prior.start(20)[1])[0].float(), step, rtol=0.02, atol=0.05)
 
 
 def test_integers_of_other_libraries_are_integers(tmp_path):

@@ -5,15 +5,10 @@ import pytest
 import torch
 
 from neuroprior import (
-    FrontierPlanner,
     GRUPrior,
     MarkovPrior,
-    MCTSPlanner,
     Plans,
-    SamplingPlanner,
-    TabularWorld,
     TransformerPrior,
-    sample,
 )
 from neuroprior.sampling.states import map_state
 from tests.support.sources import every_plan, fits, refuses, seeded
@@ -154,40 +149,3 @@ def test_what_is_no_mask_or_state_is_refused():
 @pytest.mark.parametrize("mask", [[0, 0, 1, 0], torch.tensor([0, 0, 1, 0]), torch.tensor([0, 0, 1, 0]).bool()])
 def test_masks_may_be_ones_and_zeros(mask):
     assert (PRIORS["chain"].sample(5, 3, mask=mask) == 2).all()
-
-
-class Logits:
-    """A prior whose logits are as given."""
-
-    num_actions = 3
-
-    def __init__(self, logits):
-        self.logits = logits
-
-    def start(self, batch_size):
-        wide = (
-            self.logits.repeat(batch_size, 0)
-            if isinstance(self.logits, np.ndarray)
-            else self.logits.expand(batch_size, -1)
-        )
-        return wide, torch.zeros(batch_size, 1)
-
-    def step(self, action, state):
-        return self.start(len(action))[0], state
-
-
-@pytest.mark.parametrize(
-    ("logits", "words"),
-    [
-        (torch.zeros(1, 4), "got torch.float32 [{}, 4]"),
-        (torch.zeros(1, 3, dtype=torch.long), "got torch.int64 [{}, 3]"),
-        (np.zeros((1, 3)), "got ndarray"),
-    ],
-)
-def test_logits_that_are_none_are_refused_by_samplers_and_planners(logits, words):
-    prior, world = Logits(logits), TabularWorld(torch.zeros(2, 3, dtype=torch.long), torch.zeros(2, 3))
-    with refuses("`prior` must start with floating point logits", words.format(1)):
-        sample(prior, 5, 2)
-    for planner in (SamplingPlanner, FrontierPlanner, MCTSPlanner):
-        with refuses("`prior` must start with floating point logits", words.format(1)):
-            planner(prior, 2, 4).plan(world, torch.zeros(1, dtype=torch.long))

@@ -495,18 +495,6 @@ def test_states_on_the_way_are_kept_where_they_are_asked_for(asked):
         assert rollout.states.equal(due.states)
 
 
-@pytest.mark.parametrize("method", ["ancestral", "tree"])
-@pytest.mark.parametrize("wrong", [torch.nan, -torch.inf])
-def test_nothing_is_drawn_from_logits_that_are_none(method, wrong):
-    class Wrong(UniformPrior):
-        def step(self, action, state, context=None):
-            logits, state = super().step(action, state, context)
-            return torch.full_like(logits, wrong), state
-
-    with pytest.raises(ValueError, match="prior: its logits are NaN or infinite, or -inf for all"):
-        sample(Wrong(3), 1000, 4, generator=seeded(0), method=method)
-
-
 def test_a_prior_over_vectors_is_refused():
     with refuses("prior", "numbered actions", "NoisePrior", "method sample"):
         sample(NoisePrior([-1.0], [1.0]), 2, 3)

@@ -27,8 +27,10 @@ from neuroprior import (
     worlds,
 )
 from neuroprior.behaviour import RecordedPlans, SemiMarkovPrior
+from neuroprior.control import NoisePrior
 from neuroprior.priors import AdaptivePrior
 from neuroprior.puzzles import LogLinearPrior, sliding_tiles, sokoban
+from neuroprior.sampling.states import tensors_in
 from neuroprior.testing import check_prior, check_world
 from neuroprior.testing.chi_square import alike, chi_square
 from neuroprior.worlds import Features, Rollout, cube, egocentric, four_rooms, maze
@@ -44,6 +46,17 @@ def random_plans(num_actions: int, context: Tensor | None = None, length: int = 
 
 def index_context(*shape: int) -> Tensor:
     return torch.randint(3, shape, generator=torch.Generator().manual_seed(4))
+
+
+def random_context(prior: Prior, num: int, length: int, generator: torch.Generator) -> Tensor | None:
+    """A context of each step, of the kind that the prior takes."""
+    if prior.context_size is not None:
+        return torch.randn(num, length, prior.context_size, generator=generator)
+    if prior.num_patterns is not None:
+        return torch.randint(6, (num, length, prior.num_patterns), generator=generator)
+    if prior.num_contexts is None:
+        return None
+    return torch.randint(prior.num_contexts, (num, length), generator=generator)
 
 
 def pattern_context(*shape: int) -> Tensor:
@@ -135,12 +148,134 @@ def test_no_world_is_left_out() -> None:
     assert kinds == {type(world) for world in WORLDS.values()}
 
 
+INTEGERS = [
+    torch.int8, torch.uint8, torch.int16, torch.int32, torch.int64, torch.uint16, torch.uint32, torch.uint64
+]  # fmt: skip
+LAYOUTS: dict[str, Callable[[Tensor], Tensor]] = {
+    "strided": lambda values: torch.stack([values, values], -1)[..., 0],
+    "transposed": lambda values: values.transpose(0, -1).contiguous().transpose(0, -1),
+}
+
+
+def outcomes(prior: Prior, plans: Tensor, context: Tensor | None) -> list[Tensor]:
+    """All logits and log-probabilities of some plans."""
+    first, *rest = [None] * plans.shape[1] if context is None else context.unbind(1)
+    logits, state = prior.start(len(plans), first)
+    found = [logits]
+    for action, given in zip(plans.unbind(1), rest, strict=False):
+        logits, state = prior.step(action, state, given)
+        found.append(logits)
+    return [*found, prior(plans, context), prior.log_prob(Plans(plans, prior.num_actions, context=context))]
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", PRIORS)
+def test_integers_of_every_kind_and_layout_mean_the_same_to_a_prior(name: str) -> None:
+    prior = PRIORS[name]()
+    generator = torch.Generator().manual_seed(0)
+    plans = torch.randint(min(prior.num_actions, 100), (5, 4), generator=generator)
+    context = random_context(prior, 5, 4, generator)
+    due = outcomes(prior, plans, context)
+    for kind in INTEGERS:
+        for layout in LAYOUTS.values():
+            now = context if context is None or context.is_floating_point() else context.to(kind)
+            found = outcomes(prior, layout(plans.to(kind)), None if now is None else layout(now))
+            assert all(map(torch.allclose, found, due))
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_integers_out_of_range_are_refused_by_a_prior(name: str) -> None:
+    prior = PRIORS[name]()
+    generator = torch.Generator().manual_seed(0)
+    context = random_context(prior, 3, 2, generator)
+    _, state = prior.start(3, None if context is None else context[:, 0])
+    plans = torch.zeros(3, 2, dtype=torch.long)
+    for kind in INTEGERS:
+        values = [-1] if kind.is_signed else []
+        for wrong in [*values, *([prior.num_actions] if prior.num_actions < 128 else [])]:
+            action = torch.tensor([0, 0, wrong]).to(kind)
+            for call in (
+                lambda action=action: prior.step(action, state),
+                lambda action=action: prior(torch.stack([plans[:, 0].to(action.dtype), action], 1), context),
+                lambda action=action: prior.log_prob(Plans(torch.stack([action, action], 1), prior.num_actions)),
+            ):
+                with pytest.raises(ValueError, match="is out of range"):
+                    call()
+    for wrong in (plans[:, :1], plans[:, 0].double(), plans[:, 0] > 0):
+        with pytest.raises(ValueError, match="`action` must be integers"):
+            prior.step(wrong, state)
+
+
+@pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float64])
+@pytest.mark.parametrize("name", [name for name in PRIORS if name.endswith("features")])
+def test_features_of_every_kind_are_read_in_single_precision(name: str, kind: torch.dtype) -> None:
+    """Eighths, which half precision holds; they may require gradients, which nothing that is kept does."""
+    prior = PRIORS[name]()
+    generator = torch.Generator().manual_seed(0)
+    plans = torch.randint(prior.num_actions, (5, 4), generator=generator)
+    context = torch.randint(-16, 16, (5, 4, prior.context_size), generator=generator) / 8
+    given = context.to(kind).requires_grad_()
+    stored = Plans(plans, prior.num_actions, context=given).context
+    assert stored is not None
+    assert stored.equal(context.to(stored))
+    logits, state = prior.start(5, given[:, 0])
+    kept = tensors_in((logits, state, prior.step(plans[:, 0], state, given[:, 1])))
+    for values in (stored, *kept):
+        assert not values.requires_grad
+        assert values.dtype.itemsize >= 4
+    found, due = (outcomes(prior, plans, values) for values in (given, context))
+    assert all(torch.allclose(one.float(), other, atol=1e-6) for one, other in zip(found, due, strict=True))
+    drawn = [prior.sample(5, 4, values, generator=generator.manual_seed(1)) for values in (given, context)]
+    assert drawn[0].equal(drawn[1])
+
+
+@pytest.mark.parametrize("make", [*PRIORS.values(), lambda: NoisePrior([-1.0], [1.0])], ids=[*PRIORS, "vectors"])
+def test_another_precision_is_refused(make: Callable[[], Prior]) -> None:
+    """And leaves the prior as it was."""
+    prior = make()
+    before = {name: values.clone() for name, values in prior.state_dict().items()}
+    for change in (prior.half, prior.bfloat16, prior.double, partial(prior.to, "cpu", torch.double)):
+        with pytest.raises(ValueError, match="must compute in single precision"):
+            change()
+    after = prior.to("cpu").float().state_dict()
+    assert all(after[name].dtype == values.dtype and after[name].equal(values) for name, values in before.items())
+
+
+@pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS)
+def test_integers_of_every_kind_and_layout_mean_the_same_to_a_world(world: World) -> None:
+    def seeded() -> torch.Generator:
+        return torch.Generator().manual_seed(1)
+
+    state, num = world.reset(6, seeded()), world.num_actions
+    plans = torch.randint(num, (6, 4, 3), generator=seeded())
+    due = [*world.step(state, plans[:, 0, 0], seeded()), *world.rollout(state, plans, seeded())[:2]]
+    for kind in INTEGERS:
+        for layout in LAYOUTS.values():
+            given = layout(plans.to(kind))
+            found = world.step(layout(state), given[:, 0, 0], seeded()), world.rollout(layout(state), given, seeded())
+            assert all(map(torch.equal, [*found[0], *found[1][:2]], due))
+        for wrong in [num, *([-1] if kind.is_signed else [])]:
+            given = plans.clone()
+            given[2, 0] = wrong
+            for call in (
+                partial(world.step, state, given[:, 0, 0].to(kind)),
+                partial(world.rollout, state, given.to(kind)),
+            ):
+                with pytest.raises(ValueError, match=f"{wrong} is out of range"):
+                    call()
+    for none in (plans[:2, 0, 0], plans[:, 0], plans[:, 0, 0].double()):
+        with pytest.raises(ValueError, match="`action` must be integers"):
+            world.step(state, none)
+
+
 class Broken(MarkovPrior):
     """A right prior, to be broken in one place."""
 
-    def __init__(self, num_actions: int = 3, order: int = 2, **settings: object) -> None:
-        super().__init__(num_actions, order)
-        self.fit(random_plans(num_actions))
+    def __init__(
+        self, num_actions: int = 3, order: int = 2, num_contexts: int | None = None, **settings: object
+    ) -> None:
+        super().__init__(num_actions, order, num_contexts=num_contexts)
+        self.fit(random_plans(num_actions, None if num_contexts is None else index_context(60) % num_contexts))
 
 
 class WrongStep(Broken):
@@ -158,6 +293,34 @@ class HiddenMemory(Broken):
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         logits, state = super().step(action, state)
         return logits + torch.arange(len(action))[:, None] * torch.arange(self.num_actions) / 10, state
+
+
+class Together(Broken):
+    """Takes the mean of the logits of all plans that it is asked for together."""
+
+    forward = Prior.forward
+
+    def __init__(self, method: str) -> None:
+        super().__init__(num_contexts=2)
+        self.method = method
+
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        logits, state = super().start(batch_size, context)
+        return logits.mean(0).expand_as(logits) if self.method == "start" else logits, state
+
+    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        logits, state = super().step(action, state, context)
+        return logits.mean(0).expand_as(logits) if self.method == "step" else logits, state
+
+
+class AllTogether(Broken):
+    def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
+        return super().forward(plans, context).mean(0).expand(*plans.shape, -1)
+
+
+class WholeNumbers(Broken):
+    def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
+        return super().forward(plans, context).long()
 
 
 class Unnormalised(Broken):
@@ -260,17 +423,21 @@ class Unsavable(Broken):
     ("broken", "message"),
     [
         (WrongStep, "stepping differs from forward"),
-        (HiddenMemory, "stepping differs from forward|reordering the state"),
+        (HiddenMemory, "stepping differs from forward|with the plans beside it"),
+        (partial(Together, "start"), "^forward: the logits of a plan change by .* nats with the plans beside it"),
+        (partial(Together, "step"), "^forward: the logits of a plan change by .* nats with the plans beside it"),
+        (AllTogether, "^forward: the logits of a plan change by .* nats with the plans beside it"),
         (Unnormalised, "sum to 1.1"),
         (WrongSamples, "do not fit log_prob"),
         (GlobalRandomness, "same seed gave other plans|global generator"),
         (partial(Forgetful, bonus=1.0), "saved, loaded"),
         (ReadsContext, "step: .* `step` is given None where the last context goes on"),
         (Unsavable, "cannot be saved and loaded"),
-        (OneMore, r"^start must return floating point logits \[7, 3\], got torch.float32 \[7, 4\]$"),
-        (Integers, r"^step must return floating point logits \[7, 3\], got torch.int64 \[7, 3\]$"),
-        (Arrays, r"^start must return floating point logits \[7, 3\], got ndarray$"),
-        (LogitsAlone, "^start must return logits and a state$"),
+        (OneMore, r"^`start` must return floating point logits \[7, 3\], got torch.float32 \[7, 4\]$"),
+        (Integers, r"^`step` must return floating point logits \[7, 3\], got torch.int64 \[7, 3\]$"),
+        (WholeNumbers, r"^`forward` must return floating point logits \[7, 1, 3\], got torch.int64 \[7, 1, 3\]$"),
+        (Arrays, r"^`start` must return floating point logits \[7, 3\], got ndarray$"),
+        (LogitsAlone, r"^`start` must return logits and a state, got torch.float32 \[7, 3\]$"),
         (Overwrites, "^step must leave the state that it is given as it is, and return another$"),
         (FitsToNothing, "^fit must return the prior itself, got NoneType$"),
     ],

@@ -20,6 +20,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from neuroprior._files import unquote_cell
 from neuroprior.behaviour.reading.names import KNOWN_NAMES, PROGRAMS, STEM_NUMBER, plain
 from neuroprior.behaviour.reading.problems import ReadingError
 
@@ -281,8 +282,10 @@ def _sheet_of_jwatcher(lines: list[str], first: int, label: str, stem: str) -> S
 
 
 def _strip(column: "pd.Series[Any]") -> "pd.Series[Any]":
+    """Return cells of text without space around them, and names as they were before they were written."""
     codes, values = pd.factorize(column)
-    return pd.Series(np.array([str(value).strip() for value in values], dtype=object)[codes], dtype=object)
+    texts = np.array([unquote_cell(str(value).strip()) for value in values], dtype=object)
+    return pd.Series(texts[codes], dtype=object)
 
 
 def _decode(content: bytes, label: str) -> tuple[str, list[str]]:

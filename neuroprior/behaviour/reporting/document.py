@@ -18,7 +18,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.text import Text
 
-from neuroprior._files import versions, write_json, write_whole, written_whole
+from neuroprior._files import quote_frame, versions, write_json, write_whole, written_whole
 from neuroprior._folders import claim
 from neuroprior.behaviour.reporting.findings import Sentence
 from neuroprior.behaviour.reporting.page import Section, Table, clean, write_page
@@ -167,7 +167,7 @@ def write_frames(folder: Path, frames: Mapping[str, pd.DataFrame]) -> None:
         place.add(files)
         for name, frame in files.items():
             with written_whole(folder / name) as file:
-                frame.to_csv(file, index=False, lineterminator="\n")
+                quote_frame(frame).to_csv(file, index=False, lineterminator="\n")
 
 
 def write_graph(path: Path, graph: nx.DiGraph) -> None:

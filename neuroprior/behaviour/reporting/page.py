@@ -55,6 +55,13 @@ STYLE: Any = {
 }
 """Settings of matplotlib under which a figure for a page is made."""
 
+_LETTER = "\u0590-\u08ff\ufb1d-\ufdff\ufe70-\ufefc\U00010800-\U00010fff\U0001e800-\U0001efff"
+_CONTROL = "\u200f\u202a-\u202e\u2066-\u2069"
+_WORD = rf"[^\s,;:()]*[{_LETTER}{_CONTROL}][^\s,;:()]*"
+
+RIGHT_TO_LEFT = re.compile(rf"({_WORD}(?: +{_WORD})*)")
+"""Words that are read from right to left, or say so: without isolation they reorder the numbers beside them."""
+
 SMALLEST = 9.5
 """Height of the smallest text of a figure, CSS pixels, down to which it shrinks with the page; then its box scrolls."""
 
@@ -177,6 +184,7 @@ def write_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["plain"] = lambda value: Markup.escape(clean(value))  # where there can be no elements
     drawings = [
         [_drawing(box, f"figure-{s}-{number}-") for number, box in enumerate(section.figures, 1)]
         for s, section in enumerate(sections, 1)
@@ -218,7 +226,9 @@ def _printable(value: Any) -> Any:
     """What stands in the page for a value of the template; what is markup already stays as it is."""
     if isinstance(value, Markup):
         return value
-    return clean(", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value))
+    text = clean(", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value))
+    parts = RIGHT_TO_LEFT.split(text)  # every second one is to be isolated
+    return Markup("").join(Markup("<bdi>{}</bdi>").format(part) if k % 2 else part for k, part in enumerate(parts))
 
 
 def _sized(text: str) -> str:

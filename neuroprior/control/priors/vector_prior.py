@@ -1,7 +1,6 @@
 """The interface of a prior over vectors in time, and what it predicts: a distribution over the next vector."""
 
 from abc import abstractmethod
-from collections.abc import Callable
 from math import log, pi
 from typing import Any, NamedTuple, Self
 
@@ -192,14 +191,6 @@ class VectorPrior(SavedModule):
         inside = (self.middle + self.half_range * scaled).clamp(self.action_low, self.action_high)
         above = torch.where(scaled >= 1, self.action_high, inside)
         return torch.where(scaled <= -1, self.action_low, above)
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """What `nn.Module` moves a module by; also refuses another precision, in which not every prior computes."""
-        dtype = fn(self.action_low).dtype
-        if dtype != self.action_low.dtype:
-            raise ValueError(f"priors over vectors must compute in single precision, torch.float32, got {dtype}")
-        applied: Self = super()._apply(fn, recurse)
-        return applied
 
     @property
     def device(self) -> torch.device:

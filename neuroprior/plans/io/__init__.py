@@ -61,7 +61,8 @@ def read_plans(
 
     Args:
         path: the file or dataset.
-        num_actions: A; None for what the file says, else the number of names, else the largest action + 1.
+        num_actions: A; None for what the file says, else the number of names, else the largest action + 1, at most
+            65,536: larger numbers are seldom actions.
         action_names: A names in the order of their numbers; without them the names are sorted.
 
     Returns:
@@ -72,7 +73,9 @@ def read_plans(
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: an argument or the file is wrong; the message names the file and the line or the array.
+        ValueError: an argument or the file is wrong; the message names the file and the line or the array. So are data
+            that would take over 256 MiB and 100 times what they hold: plans padded to one that is far longer than the
+            others, arrays that are compressed so much (`np.savez` writes them otherwise).
 
     Example:
         >>> write_plans(

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from neuroprior.plans.columns import Floats, Integers, Names, as_single, padded
+from neuroprior.plans.columns import Floats, Integers, Names, as_single, count_up_to, padded
 from neuroprior.plans.plans import AnyPlans, Plans, action_dtype
 
 
@@ -47,16 +47,20 @@ def assembled(
     if num_actions is None and not len(actions):
         raise ValueError(f"{source}: no plan has an action, so num_actions must be given")
     if num_actions is None:
-        num_actions = int(actions.max()) + 1
+        try:
+            num_actions = count_up_to(int(actions.max()))
+        except ValueError as error:
+            raise ValueError(f"{source}: {error}") from None
     dtype = torch.empty(0, dtype=action_dtype(num_actions)).numpy().dtype
     longest = int(lengths.max()) if len(lengths) else 0
     if context is not None:
         is_whole = context.dtype.kind in "iu"
         context = context.astype(np.int64) if is_whole else as_single(f"{source}: context", context)
         context = padded(context, lengths, source) if per_step else context
+    wide = torch.from_numpy(padded(actions.astype(dtype), lengths, source))
     try:
         return Plans(
-            torch.from_numpy(padded(actions.astype(dtype), lengths, source)),
+            wide,
             num_actions,
             None if end is None and (lengths == longest).all() else torch.from_numpy(lengths),
             action_names,

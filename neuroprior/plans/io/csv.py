@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from neuroprior._files import written_whole
+from neuroprior._files import quote_cell, written_whole
 from neuroprior.plans.columns import (
     LARGEST_FLOAT,
     Column,
@@ -265,12 +265,16 @@ def _rows_of(plans: Plans) -> Iterator[list[Any]]:
         features = context.shape[-1] if context.is_floating_point() else 0
         header += [f"context_{i + 1}" for i in range(features)] or ["context"]
     yield header + ["group"] * (plans.group is not None)
+    action_names, context_names, group_names = (
+        None if names is None else list(map(quote_cell, names))
+        for names in (plans.action_names, plans.context_names, plans.group_names)
+    )
     for start in range(0, len(plans), 2**14):
         part = plans[start : start + 2**14]
         none: list[list[Any]] = [[]] * len(part)
-        contexts = none if context is None else named(context[start : start + 2**14].tolist(), plans.context_names)
-        groups = none if part.group is None else named(part.group.tolist(), plans.group_names)
-        actions, lengths = named(part.actions.tolist(), plans.action_names), part.mask().sum(1).tolist()
+        contexts = none if context is None else named(context[start : start + 2**14].tolist(), context_names)
+        groups = none if part.group is None else named(part.group.tolist(), group_names)
+        actions, lengths = named(part.actions.tolist(), action_names), part.mask().sum(1).tolist()
         for taken, length, *own in zip(actions, lengths, contexts, groups, strict=True):
             more = [cell for entry in own for cell in (entry if isinstance(entry, list) else [entry])]
             yield [*taken[:length], *[""] * (width - length), *more]

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neuroprior._checks import check_single_precision
+from neuroprior._checks import check_memory, check_single_precision
 from neuroprior._files import written_whole
-from neuroprior.plans.columns import Names, check_file, warn_of_unused
+from neuroprior.plans.columns import Names, check_file, count_up_to, grows_too_much, warn_of_unused
 from neuroprior.plans.io.assembly import renamed
 from neuroprior.plans.plans import AnyPlans, Plans
 from neuroprior.plans.sequences import constant_context
@@ -47,7 +47,7 @@ def read_npz(path: Path, num_actions: int | None, action_names: Names | None, ki
         known = len(names["action_names"])
     try:
         if known is None:
-            known = _largest(numbers) + 1 if action_names is None else len(action_names)
+            known = count_up_to(_largest(numbers)) if action_names is None else len(action_names)
         plans = kind(**whole | {"num_actions": known}, **numbers, **names)
         if plans.context is not None and plans.context.is_floating_point():
             check_single_precision("context", plans.context[plans.mask()])
@@ -98,6 +98,7 @@ def arrays_of(path: Path, keys: Sequence[str]) -> tuple[dict[str, NDArray[Any]],
         with np.load(path, allow_pickle=False) as file:
             found = {}
             for key in [key for key in file.files if key in keys]:
+                _check_growth(next(one for one in file.zip.infolist() if one.filename in (key, f"{key}.npy")))
                 found[key] = np.asarray(file[key])
             return found, [key for key in file.files if key not in keys]
     except Exception as error:  # numpy, zipfile and zlib raise a dozen unrelated kinds over damaged bytes
@@ -105,6 +106,16 @@ def arrays_of(path: Path, keys: Sequence[str]) -> tuple[dict[str, NDArray[Any]],
         if "allow_pickle" in reason:
             reason = "an array of Python objects; numbers, or texts of a fixed size, are expected"
         raise ValueError(f"{path}: {key or 'the archive'}: {reason}") from error
+
+
+def _check_growth(array: zipfile.ZipInfo) -> None:
+    """Raise ValueError for an array that takes far more memory than its part of the file: zip says both before."""
+    if grows_too_much(array.file_size, array.compress_size):
+        raise ValueError(
+            f"{array.compress_size:,} bytes of the file would unpack to {array.file_size:,}; if they are meant, write"
+            " them with np.savez, not compressed"
+        )
+    check_memory(array.file_size, array=array.filename)
 
 
 def native(array: NDArray[Any]) -> NDArray[Any]:

@@ -84,8 +84,8 @@ class HistoryPrior(Prior):
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         self.check_step(action, context)
         contexts = self.num_contexts or 1
-        node = self.next_node.view(-1)[state.div(contexts, rounding_mode="floor") * self.num_actions + action].long()
-        return self._at(node, state % contexts if context is None else context.long())
+        place = state.div(contexts, rounding_mode="floor") * self.num_actions + action.long()
+        return self._at(self.next_node.view(-1)[place].long(), state % contexts if context is None else context.long())
 
     def draw_plans(
         self, state: Tensor, counts: Tensor, length: int, temperature: float, generator: torch.Generator

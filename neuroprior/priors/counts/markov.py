@@ -1,6 +1,6 @@
 """Markov priors of any order: counts of what followed the last k actions, with back-off to shorter histories."""
 
-from itertools import groupby
+from itertools import groupby, pairwise
 from operator import itemgetter
 from typing import Any, Literal, get_args
 
@@ -19,9 +19,6 @@ BACKOFFS: tuple[Backoff, ...] = get_args(Backoff)
 
 FALLBACK_DISCOUNTS = (0.5, 1.0, 1.5)
 """Discounts of Kneser-Ney where the counts give none: those of KenLM's option `--discount_fallback`."""
-
-SMALL = 2**20
-"""Entries of a table up to which those of all smoothings are computed together, else one after another."""
 
 BACKOFFS_TRIED: list[tuple[Backoff, float]] = [
     ("kneser-ney", 1),
@@ -167,15 +164,76 @@ def blend(n: Tensor, lower: Tensor, rule: Backoff, smoothing: Tensor | float, di
     `smoothing` is `[S, 1, 1]`, or a number for all.
     """
     if rule == "kneser-ney":
-        # Counts of one, of two and of more are reduced by their discounts; this mass goes to `lower`.
-        off = (torch.cat([discounts.new_zeros(1), discounts])[n.clamp(max=3).long()] * smoothing).minimum(n)
-        total = n.sum(-1, keepdim=True)
-        share = torch.where(total > 0, off.sum(-1, keepdim=True) / total.clamp(min=1), 1.0)
-        return (n - off) / total.clamp(min=1) + share * lower
+        off = discounted(n, discounts, smoothing)
+        return interpolate(n - off, off.sum(-1, keepdim=True), n.sum(-1, keepdim=True), lower)
     kinds = (n > 0).sum(-1, keepdim=True) if rule == "witten-bell" else torch.ones_like(n[..., :1])
     weight = kinds.double() * smoothing
-    total = n.sum(-1, keepdim=True) + weight
-    return torch.where(total > 0, (n + weight * lower) / total, lower)
+    return interpolate(n, weight, n.sum(-1, keepdim=True) + weight, lower)
+
+
+def discounted(n: Tensor, discounts: Tensor, smoothing: Tensor | float) -> Tensor:
+    """What Kneser-Ney smoothing takes off counts `n` of one, of two and of more, for those after the shorter history.
+
+    `discounts [3]` are times `smoothing`.
+    """
+    return (torch.cat([discounts.new_zeros(1), discounts])[n.clamp(max=3).long()] * smoothing).minimum(n)
+
+
+def interpolate(kept: Tensor, given: Tensor, total: Tensor, lower: Tensor) -> Tensor:
+    """Probabilities from counts that are `kept`, and the mass that is `given` to `lower`, of a `total` of both."""
+    return torch.where(total > 0, (kept + given * lower) / total.clamp(min=1e-300), lower)
+
+
+def entry_log_probs(
+    tree: Tree,
+    counts: Counts,
+    num_contexts: int | None,
+    num_actions: int,
+    rule: Backoff,
+    smoothing: Tensor,
+    entry: Tensor,
+) -> Tensor:
+    """Of `back_off_log_probs`, flattened after its first dimension, those at `entry [E]` alone: `[S, E]`, float64.
+
+    Where actions are many, most of the table is of those that never followed.
+    """
+    contexts, row, action = num_contexts or 1, entry.div(num_actions, rounding_mode="floor"), entry % num_actions
+    number, values = len(counts.row_code), (counts.kinds if rule == "kneser-ney" else counts.count).double()
+    root = torch.full((len(smoothing), 1, num_actions), 1 / num_actions, dtype=torch.double, device=entry.device)
+    if num_contexts is not None:
+        root = _pooled(counts, contexts, root, rule, smoothing[:, None, None])
+    probs = root[:, 0, action]
+    if rule == "kneser-ney":
+        ends = torch.tensor(level_bounds(tree, counts, contexts), device=entry.device)
+        off = torch.cat(
+            [
+                discounted(values[first:until], kneser_ney_discounts(counts.kinds[first:until]), smoothing[:, None])
+                for first, until in pairwise(torch.searchsorted(counts.row, ends).tolist())
+            ],
+            1,
+        )
+        kept, given = values - off, _row_sums(counts, off)
+        total = _row_sums(counts, values[None])
+    else:
+        kinds = _row_sums(counts, torch.ones_like(values)[None]) if rule == "witten-bell" else torch.ones(1, number)
+        kept, given = values.expand(len(smoothing), -1), kinds.double() * smoothing[:, None]
+        total = _row_sums(counts, values[None]) + given
+    code, parent = counts.row * num_actions + counts.action, parent_rows(tree, counts, contexts)
+    above = [row]
+    while bool((above[-1] < number).any()):
+        above.append(torch.cat([parent, parent.new_tensor([number])])[above[-1]])
+    for here in reversed(above):
+        inside = (here < number).nonzero()[:, 0]
+        rows, wanted = here[inside], here[inside] * num_actions + action[inside]
+        place = torch.searchsorted(code, wanted).clamp(max=len(code) - 1)
+        there = kept[:, place] * (code[place] == wanted)
+        probs[:, inside] = interpolate(there, given[:, rows], total[:, rows], probs[:, inside])
+    return probs.clamp(min=1e-300).log()
+
+
+def _row_sums(counts: Counts, values: Tensor) -> Tensor:
+    """The sums `[S, R]` over each row of `values [S, P]`."""
+    return values.new_zeros(len(values), len(counts.row_code)).index_add_(1, counts.row, values)
 
 
 def kneser_ney_discounts(counts: Tensor) -> Tensor:
@@ -231,14 +289,13 @@ class Chains:
             ValueError: other actions or another context than those of the chains.
         """
         entry = self._first.entries(plans if self.num_contexts is not None else plans.without_context())
+        entry, times = entry.unique(return_counts=True)
         sums = []
-        small = len(self._counted[1].row_code) * plans.num_actions <= SMALL
         for rule, some in groupby(BACKOFFS_TRIED, key=itemgetter(0)):
             smoothing = torch.tensor([each for _, each in some], dtype=torch.double, device=entry.device)
-            for part in (smoothing,) if small else smoothing.split(1):
-                tables = back_off_log_probs(*self._counted, self.num_contexts, plans.num_actions, rule, part)
-                sums += [table.flatten()[entry].double().sum() for table in tables]
-        return torch.stack(sums).cpu()
+            found = entry_log_probs(*self._counted, self.num_contexts, plans.num_actions, rule, smoothing, entry)
+            sums.append(found @ times.double())
+        return torch.cat(sums).cpu()
 
     def chain(self, number: int) -> MarkovPrior:
         """The chain with the back-off of that number."""

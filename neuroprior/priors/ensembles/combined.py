@@ -26,6 +26,8 @@ from neuroprior.priors.ensembles.mixture import (
     learned_weights,
     mixed,
     priors_in,
+    start_experts,
+    step_experts,
     weights_before,
 )
 from neuroprior.priors.ensembles.pooling import (
@@ -35,7 +37,6 @@ from neuroprior.priors.ensembles.pooling import (
     stack_forecasts,
     with_pool,
 )
-from neuroprior.priors.ensembles.stacked import context_for
 from neuroprior.priors.learning import (
     counted_plans,
     known_plans,
@@ -191,13 +192,13 @@ class CombinedPrior(MixturePrior):
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, State]:
         self.check_start(batch_size, context)
-        found = [e.start(batch_size, context_for(e, context)) for e in self._experts()]
+        found = start_experts(self._experts(), batch_size, context)
         return self._mixed_now(self.first.expand(batch_size, -1), self.tracking.expand(batch_size, -1), found)
 
     def step(self, action: Tensor, state: Any, context: Tensor | None = None) -> tuple[Tensor, State]:
         self.check_step(action, context)
         weights, tracking, forecasts, *states = state
-        found = [e.step(action, s, context_for(e, context)) for e, s in zip(self._experts(), states, strict=True)]
+        found = step_experts(self._experts(), action, states, context)
         taken = taken_of(forecasts, action)
         weights = after(weights, taken, self.first, 0)
         if self.share:

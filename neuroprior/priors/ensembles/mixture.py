@@ -21,6 +21,7 @@ from neuroprior.priors.learning import (
 )
 from neuroprior.priors.prior import Prior, taken_of
 from neuroprior.sampling.states import State
+from neuroprior.sampling.stepping import check_outputs
 
 SHARES = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Candidates for the share; `fit` takes the best."""
@@ -125,14 +126,14 @@ class MixturePrior(Prior):
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, State]:
         self.check_start(batch_size, context)
-        found = [e.start(batch_size, context_for(e, context)) for e in self._experts()]
+        found = start_experts(self._experts(), batch_size, context)
         weights = self.first.expand(batch_size, -1)
         return self._mixed(weights, found)
 
     def step(self, action: Tensor, state: Any, context: Tensor | None = None) -> tuple[Tensor, State]:
         self.check_step(action, context)
         weights, forecasts, *states = state
-        found = [e.step(action, s, context_for(e, context)) for e, s in zip(self._experts(), states, strict=True)]
+        found = step_experts(self._experts(), action, states, context)
         return self._mixed(after(weights, taken_of(forecasts, action), self.first, self.share), found)
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
@@ -209,6 +210,23 @@ class MixturePrior(Prior):
     def _mixed(self, weights: Tensor, found: list[tuple[Tensor, State]]) -> tuple[Tensor, State]:
         forecasts = torch.stack([logits.log_softmax(-1) for logits, _ in found], 1)
         return mixed(weights, forecasts), (weights, forecasts, *(state for _, state in found))
+
+
+def start_experts(experts: Sequence[Prior], batch_size: int, context: Tensor | None) -> list[tuple[Tensor, State]]:
+    """Logits `[N, A]` and the state of each expert, before the first action."""
+    return [
+        check_outputs(e.start(batch_size, context_for(e, context)), batch_size, e.num_actions, "start") for e in experts
+    ]
+
+
+def step_experts(
+    experts: Sequence[Prior], action: Tensor, states: Sequence[State], context: Tensor | None
+) -> list[tuple[Tensor, State]]:
+    """Logits `[N, A]` and the next state of each expert, after `action [N]` in its state."""
+    return [
+        check_outputs(e.step(action, state, context_for(e, context)), len(action), e.num_actions, "step")
+        for e, state in zip(experts, states, strict=True)
+    ]
 
 
 def priors_in(modules: nn.ModuleList) -> list[Prior]:

@@ -11,6 +11,7 @@ from neuroprior._checks import check_count, check_memory, check_seed, check_size
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import check_alike
+from neuroprior.plans.plans import as_single
 from neuroprior.priors.learning import training_plans, validation_plans
 from neuroprior.priors.neural.features import Standardise
 from neuroprior.priors.prior import Prior
@@ -227,6 +228,7 @@ class NeuralPrior(Prior):
 
     def _read(self, previous: Tensor, context: Tensor | None, hidden: State | None) -> tuple[Tensor, State]:
         """Logits `[N, A]` after actions `previous [N]`, and the prior's state."""
+        context = None if context is None else as_single(context.detach())
         given = None if context is None else context[:, None]
         logits, hidden = self.encode(self._shown(previous)[:, None], given, hidden)
         return logits[:, 0], (context, hidden) if self.takes_context else hidden

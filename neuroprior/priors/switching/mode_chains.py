@@ -40,8 +40,8 @@ class ModeChains:
         ]
 
     def entries(self, row: Tensor, action: Tensor) -> Tensor:
-        """The entries of actions after these rows; both must have occurred."""
-        return torch.searchsorted(self.code, row * self.num_actions + action)
+        """The entries of actions after these rows; any entry for what has not occurred, as beyond a plan's end."""
+        return torch.searchsorted(self.code, row * self.num_actions + action).clamp_(max=len(self.code) - 1)
 
     def totals(self, longest: Tensor) -> Tensor:
         """Expected counts `[P, K]` after all histories, from those after the longest alone."""
@@ -56,15 +56,10 @@ class ModeChains:
         Args:
             expected: `[P, K]`, counts after all histories, as `totals` returns them.
         """
-        counts, modes, number = self.counts, expected.shape[1], len(self.counts.row_code)
-        own = expected.new_full((number + 1, modes, self.num_actions), 1 / self.num_actions)
+        modes, number = expected.shape[1], len(self.counts.row_code)
+        own = expected.new_empty(number + 1, modes, self.num_actions)
         whole = own[:, 0].clone()  # of all modes together
-        if self.pooled:
-            until = int(torch.searchsorted(counts.row_code, self.contexts))
-            first = _dense(expected, *self._entries(0, until), (until, self.num_actions)).sum(0)
-            kinds = (first.sum(0) > 0).sum()[None]
-            whole[-1] = self._blend(first.sum(0), whole[-1], kinds)
-            own[-1] = self._blend(first, whole[-1].expand(modes, -1), kinds)
+        own[-1], whole[-1] = self._everywhere(expected)
         for block in self._blocks(modes):
             here, above = block.rows, block.above
             n = _dense(expected, block.entries, block.row, block.action, block.size)
@@ -72,6 +67,38 @@ class ModeChains:
             base = (1 - block.share) * own[above] + block.share * whole[here, None]
             own[here] = self._blend(n, base, block.kinds[:, None])
         return own.clamp(min=1e-300).log()
+
+    def entry_log_probs(self, expected: Tensor) -> Tensor:
+        """Of `log_probs` the P entries alone, `[P, K]`: those of the actions that occurred after each history.
+
+        Where actions are many, most of the table is of those that never did.
+        """
+        row, action, n = self.counts.row, self.counts.action, expected.clamp(min=0)
+        total = n.new_zeros(len(self.kinds), n.shape[1]).index_add_(0, row, n)[row]
+        kinds = self.kinds[row, None]
+        own, whole = self._everywhere(expected)
+        own, whole = own[:, action].T.contiguous(), whole[action][:, None]
+        for first, until, above in [(0, self.above[-1][0] if self.above else len(n), None), *reversed(self.above)]:
+            here = slice(first, until)
+            over, share = (here, 1.0) if above is None else (above, self.sharing)
+            every = n[here].sum(1, keepdim=True), total[here].sum(1, keepdim=True)
+            whole[here] = self._interpolate(*every, whole[over], kinds[here])
+            base = (1 - share) * own[over] + share * whole[here]
+            own[here] = self._interpolate(n[here], total[here], base, kinds[here])
+        return own.clamp(min=1e-300).log()
+
+    def _everywhere(self, expected: Tensor) -> tuple[Tensor, Tensor]:
+        """The probabilities `[K, A]` in contexts without counts, and those of all modes together, `[A]`."""
+        counts, modes = self.counts, expected.shape[1]
+        own = expected.new_full((modes, self.num_actions), 1 / self.num_actions)
+        whole = own[0]
+        if self.pooled:
+            until = int(torch.searchsorted(counts.row_code, self.contexts))
+            first = _dense(expected, *self._entries(0, until), (until, self.num_actions)).sum(0)
+            kinds = (first.sum(0) > 0).sum()[None]
+            whole = self._blend(first.sum(0), whole, kinds)
+            own = self._blend(first, whole.expand(modes, -1), kinds)
+        return own, whole
 
     def _blocks(self, modes: int) -> list["_Block"]:
         """The blocks of rows for a number of modes; found once, as EM goes through them in each iteration."""
@@ -91,8 +118,12 @@ class ModeChains:
 
     def _blend(self, n: Tensor, base: Tensor, kinds: Tensor) -> Tensor:
         """Probabilities `[..., A]` from counts and what they are interpolated with; `kinds [..., 1]` of actions."""
+        return self._interpolate(n, n.sum(-1, keepdim=True), base, kinds)
+
+    def _interpolate(self, n: Tensor, total: Tensor, base: Tensor, kinds: Tensor) -> Tensor:
+        """As `_blend`, of some of the actions, whose counts after the same history are `total` in all."""
         weight = self.smoothing * kinds
-        total = n.sum(-1, keepdim=True) + weight
+        total = total + weight
         # Where a fold is left out, rounding leaves counts that are hardly 0.
         return torch.where(total > 1e-9, (n + weight * base) / total.clamp(min=1e-9), base)
 

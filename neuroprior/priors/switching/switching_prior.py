@@ -187,7 +187,7 @@ class SwitchingPrior(HistoryPrior):
         contexts, action = self.num_contexts or 1, action.long()
         modes, code = state
         node, last = code.div(contexts, rounding_mode="floor"), code % contexts
-        modes = modes * self._likelihood(self.log_probs[self._row(node, last)], action)
+        modes = modes * self._likelihood(taken_of(self.log_probs[self._row(node, last)], action))
         modes = modes / modes.sum(-1, keepdim=True).clamp(min=TINY)
         context = last if context is None else context.long()
         modes = (modes[:, :, None] * self._matrices()[self._cell(context)]).sum(1)
@@ -209,7 +209,7 @@ class SwitchingPrior(HistoryPrior):
             return torch.zeros(num, length, self.num_actions, device=self.device)
         rows, cells = self.cells(plans, context)
         log_probs = self.log_probs[rows]
-        before, _, _ = predict(self.first, self._steps(cells), self._likelihood(log_probs, plans))
+        before, _, _ = predict(self.first, self._steps(cells), self._likelihood(taken_of(log_probs, plans)))
         return self._mixed(before, log_probs)
 
     def cells(self, plans: Tensor, context: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -220,10 +220,10 @@ class SwitchingPrior(HistoryPrior):
     def _cell(self, context: Tensor) -> Tensor:
         return context if len(self.transitions) > 1 else torch.zeros_like(context)
 
-    def _likelihood(self, log_probs: Tensor, actions: Tensor) -> Tensor:
-        """Of actions `[...]` in each mode and phase, `[..., K * D]`, from `log_probs [..., K, A]`."""
+    def _likelihood(self, taken: Tensor) -> Tensor:
+        """Of actions in each mode and phase, `[..., K * D]`, from their log-probabilities `taken [..., K]`."""
         # An action that no mode can take says nothing about the modes; 1e-300 would be lost in products.
-        likelihood = taken_of(log_probs, actions).double().exp().clamp(min=IMPOSSIBLE)
+        likelihood = taken.double().exp().clamp(min=IMPOSSIBLE)
         return likelihood if self.phases == 1 else likelihood.repeat_interleave(self.phases, -1)
 
     def _matrices(self) -> Tensor:
@@ -383,11 +383,12 @@ class SwitchingPrior(HistoryPrior):
         """Indices of plans that are inferred together, and the `steps` and the `likelihood` of inference in them."""
         for indices in _parts(plans, self._elements):
             part = plans[indices]
-            yield indices, *self._inputs(part, *self.cells(part.actions, part.context))
+            rows, cells = self.cells(part.actions, part.context)
+            yield indices, *self._inputs(part, cells, taken_of(self.log_probs[rows], part.actions))
 
-    def _inputs(self, plans: Plans, rows: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
-        """The `steps` and the `likelihood` of inference in plans."""
-        steps, likelihood = self._steps(cells), self._likelihood(self.log_probs[rows], plans.actions)
+    def _inputs(self, plans: Plans, cells: Tensor, taken: Tensor) -> tuple[Tensor, Tensor]:
+        """The `steps` and the `likelihood` of inference in plans, from the log-probabilities of their actions."""
+        steps, likelihood = self._steps(cells), self._likelihood(taken)
         if plans.lengths is not None:
             # Else the most probable path would be that into modes that last, beyond the plan's end.
             beyond = ~plans.mask()
@@ -408,12 +409,11 @@ class SwitchingPrior(HistoryPrior):
 
 
 class _Part(NamedTuple):
-    """Plans of one fold that are inferred together, with the row, the cell and the entry of each action, `[n, L]`."""
+    """Plans of one fold that are inferred together, with the cell and the entry of each action, `[n, L]`."""
 
     fold: int
     mask: Tensor | None  # [n, L]: the actions; None: there is nothing beyond the ends
     plans: Plans
-    rows: Tensor
     cells: Tensor
     entries: Tensor
     indices: Tensor
@@ -436,7 +436,7 @@ class _Learner:
                 rows, cells = prior.cells(part.actions, part.context)
                 entries = self.chains.entries(rows.flatten(), part.actions.long().flatten()).view(rows.shape)
                 mask = None if bool(part.mask().all()) else part.mask()
-                self.parts.append(_Part(number, mask, part, rows, cells, entries, indices))
+                self.parts.append(_Part(number, mask, part, cells, entries, indices))
 
     def random_start(self, generator: torch.Generator) -> Modes:
         """Modes in random segments."""
@@ -496,8 +496,8 @@ class _Learner:
             if part.fold != fold:
                 fold = part.fold
                 others = whole if self.folds == 1 else whole - modes.expected[fold]
-                prior.log_probs = self.chains.log_probs(self.chains.totals(others))
-            inferred = smooth(prior.first, *prior._inputs(part.plans, part.rows, part.cells))
+                log_probs = self.chains.entry_log_probs(self.chains.totals(others))
+            inferred = smooth(prior.first, *prior._inputs(part.plans, part.cells, log_probs[part.entries]))
             self._count(found, part, inferred.smoothed)
             self._count_moves(totals, part, inferred.moved)
             log_likelihood += float(_known(inferred.log_likelihood, part.mask).sum())

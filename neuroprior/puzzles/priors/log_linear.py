@@ -200,7 +200,7 @@ class LogLinearPrior(Prior):
             got = "none" if patterns is None else f"{patterns.dtype} {list(patterns.shape)}"
             raise ValueError(f"`context` must be {self.num_patterns} patterns of each state, integers, got {got}.")
         parts = patterns.split(max(AT_ONCE // patterns.shape[1], 1))
-        return torch.cat([self.weights[self.rows(some)].sum(1) for some in parts])
+        return torch.cat([self.weights[self.rows(some.to(torch.int32))].sum(1) for some in parts])
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         self.check_start(batch_size, context)

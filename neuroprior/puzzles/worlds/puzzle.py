@@ -22,7 +22,7 @@ from neuroprior.puzzles.worlds.rules import (
 )
 from neuroprior.puzzles.worlds.windows import Windows
 from neuroprior.worlds.observations import Patterns
-from neuroprior.worlds.world import World
+from neuroprior.worlds.world import World, check_action
 
 
 class PuzzleWorld(World):
@@ -111,7 +111,8 @@ class PuzzleWorld(World):
 
         The reward is 1 for the step that solves the puzzle, else 0.
         """
-        return self._step(state, action, absorbing=True)
+        PuzzleWorld.check_state(self, state)  # what is on the boards is known where a search begins
+        return self._step(state, check_action(action, len(state), self.num_actions), absorbing=True)
 
     def _step(self, state: Tensor, action: Tensor, absorbing: bool) -> tuple[Tensor, Tensor]:
         boards = flat_boards(state)

@@ -23,7 +23,7 @@ from neuroprior.worlds.simulators.generators import (
 from neuroprior.worlds.simulators.readers import Reader, find_reader
 from neuroprior.worlds.simulators.store import Recent, Store
 from neuroprior.worlds.simulators.trials import Noise, Start, changes_by_noise
-from neuroprior.worlds.world import Rollout, World, check_plans, on_cpu
+from neuroprior.worlds.world import Rollout, World, check_action, check_plans, on_cpu
 
 Result = TypeVar("Result", bound=tuple[Any, ...])
 
@@ -156,6 +156,8 @@ class SimulatorWorld(World):
 
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         """See `World.step`. An action that is not legal changes nothing, with a reward of 0."""
+        self.check_state(state)
+        action = check_action(action, len(state), self.num_actions)
         generator = generator_on(generator, "cpu")
         return self._run(lambda: self._step(state, action, generator), state, action[:, None, None])
 

@@ -1,5 +1,6 @@
 """The page of results: escaped, self-contained, the same bytes each time, and legible figures of the right numbers."""
 
+import html
 import re
 from html.parser import HTMLParser
 from typing import Any
@@ -418,3 +419,21 @@ def test_ethograms_of_much_and_of_little():
     assert len(strips(ethogram_figure(ends))[0]) == 1
     with refuses("plans", "no figure"):
         ethogram_figure(Plans(torch.zeros(2, 0, dtype=torch.long), 2))
+
+
+@pytest.mark.parametrize(
+    ("text", "isolated"),
+    [
+        ("plain <b> 12", "plain &lt;b&gt; 12"),
+        ("שלום 12 (3, אב גד)", "<bdi>שלום</bdi> 12 (3, <bdi>אב גד</bdi>)"),
+        ("\u202e<i>x 7", "<bdi>\u202e&lt;i&gt;x</bdi> 7"),
+    ],
+)
+def test_names_from_right_to_left_do_not_move_the_numbers_beside_them(text, isolated, tmp_path):
+    section = Section(text, [text], [Table(["a", text], [[text, "1"]], text, title=text)], files=[f"{text}.csv"])
+    write_page(tmp_path / "a.html", text, [text, text], [section], {"names": [text]}, text)
+    page = (tmp_path / "a.html").read_text(encoding="utf-8")
+    plain = html.escape(text).replace("&quot;", "&#34;")
+    assert page.count(isolated) == 13 + 2 * (isolated == plain)  # neither in the title nor in an address
+    assert f"<title>{plain}</title>" in page
+    assert f'href="{plain}.csv"' in page

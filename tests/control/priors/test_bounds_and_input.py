@@ -274,14 +274,3 @@ def test_what_never_changes_beside_others_does_not_borrow_their_spread(kind):
     prior = LINEAR[kind](plans.action_low, plans.action_high).fit(plans, generator=seeded(0))
     drawn = prior.sample(100, 10, generator=seeded(1))[..., 1]
     assert float((drawn - 3).std()) == pytest.approx(10, rel=0.1)
-
-
-def test_another_precision_is_refused():
-    """And leaves the prior as it was."""
-    plans = source(-1.0, 1.0)
-    prior = NoisePrior(plans.action_low, plans.action_high).fit(plans)
-    before = prior.log_prob(plans)
-    for change in (prior.double, prior.half, lambda: prior.to("cpu", torch.double)):
-        with pytest.raises(ValueError, match="must compute in single precision"):
-            change()
-    assert prior.to("cpu").float().log_prob(plans).equal(before)

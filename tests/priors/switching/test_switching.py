@@ -10,6 +10,7 @@ from scipy.stats import nbinom
 
 from neuroprior import Plans, load, save
 from neuroprior.priors import SwitchingPrior
+from neuroprior.priors.switching.mode_chains import ModeChains
 from neuroprior.testing import check_prior
 from tests.support.sources import refuses, seeded
 
@@ -403,3 +404,18 @@ def test_wrong_plans_are_refused():
         SwitchingPrior(3, 2, num_contexts=2).fit(some_plans())
     with refuses("actions"):
         prior.posterior(some_plans(actions=4))
+
+
+@pytest.mark.parametrize(("order", "num_contexts"), [(0, None), (0, 3), (2, None), (2, 3)])
+def test_what_occurred_is_expected_as_in_the_whole_table(order, num_contexts):
+    """EM needs the probabilities of what occurred alone; counts of a mode may be 0 after some histories."""
+    prior = SwitchingPrior(7, 2, order=order, num_contexts=num_contexts)
+    context = None if num_contexts is None else torch.randint(3, (9, 6), generator=seeded(1))
+    lengths = torch.tensor([6, 1, 3, 5, 2, 6, 4, 0, 6])
+    plans = Plans(torch.randint(7, (9, 6), generator=seeded(0)), 7, lengths=lengths, context=context)
+    tree, counts = prior.count(plans)
+    chains = ModeChains(tree, counts, num_contexts, 7, 0.7, 0.4)
+    longest = torch.rand(len(counts.row), 2, generator=seeded(2)).double().round(decimals=1).sub(0.3).clamp(min=0)
+    expected = chains.totals(longest)
+    found = chains.entry_log_probs(expected)
+    torch.testing.assert_close(found, chains.log_probs(expected)[counts.row, :, counts.action])
