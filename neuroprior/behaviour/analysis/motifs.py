@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from scipy import stats
-from scipy.special import stdtrit, xlogy
+from scipy.special import ndtri, stdtrit, xlogy
 from torch import Tensor
 
 from neuroprior._checks import as_list, check_sizes, is_whole
@@ -240,7 +240,8 @@ def _half_width(windows: _Windows, sequences: _Sequences, unit: Tensor) -> Tenso
     """`[K]`: half the width of the 95 % intervals of the logarithms of the ratios; infinite with only one unit.
 
     A ratio is a quotient of sums over units, count * total / (heads * tails). Each unit shifts its logarithm by the
-    shares that it has in these sums (the delta method; Cochran 1977, section 6.3, for one quotient).
+    shares that it has in these sums (the delta method; Cochran 1977, section 6.3, for one quotient). Where a sequence
+    is rare, or all its heads go on alike, units seem to agree: the error is at least that of a hypergeometric count.
     """
     every = torch.arange(len(sequences.counts), device=unit.device)
     squares, num_units = torch.zeros_like(sequences.total, dtype=torch.double), torch.zeros_like(sequences.total)
@@ -265,7 +266,9 @@ def _half_width(windows: _Windows, sequences: _Sequences, unit: Tensor) -> Tenso
             num_units += (middle > 0).sum(0)
     student = torch.tensor([inf, inf, *stdtrit(range(1, BLOCKS), 0.975)], dtype=torch.double, device=unit.device)
     error = (squares * num_units / (num_units - 1).clamp(min=1)).sqrt()
-    return torch.where(num_units < FEWEST_UNITS, inf, student[num_units] * error)
+    other_heads, other_tails = (1 - part.double() / sequences.total for part in (sequences.heads, sequences.tails))
+    least = ndtri(0.975) * (other_heads * other_tails / sequences.counts.clamp(min=1)).sqrt()
+    return torch.where(num_units < FEWEST_UNITS, inf, (student[num_units] * error).maximum(least))
 
 
 def _units(plans: Plans, place: Tensor) -> Tensor:

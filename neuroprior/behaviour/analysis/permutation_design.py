@@ -17,6 +17,9 @@ Kind = Literal["between", "within"]
 DRAWN_AT_ONCE = 2**21
 """Labels that are drawn at a time."""
 
+MAX_UNEVEN = 3.0
+"""How many times as many behaviours a unit may have under one condition as under another without a note."""
+
 MIN_UNITS = 2
 """Units that a condition must have at least; of more than two conditions a rarer one is left out."""
 
@@ -109,6 +112,8 @@ class PermutationDesign:
         rank[kept] = torch.where(under[kept], (under[kept].flatten().cumsum(0) - 1).view(-1, len(conditions)), -1)
         block = torch.full((len(plans),), -1)
         block[acted] = torch.where(label >= 0, rank[unit, label], -1)
+        if kind == "between" and (note := _uneven(plans.mask().sum(1).cpu(), block, of_block[:, 1], names, item)):
+            notes.append(note)
         odd = ""
         if kind == "within" and single.sum() > (~single).sum() and not _reason("between", item, under[single], names):
             several = numbers[~single].tolist()
@@ -205,6 +210,30 @@ def shuffle_within(cell: Tensor, number: int, generator: torch.Generator) -> Ten
 def _strata(plans: RecordedPlans) -> Tensor:
     """The stratum of each plan `[N]`, 0 where there are none."""
     return torch.zeros(len(plans), dtype=torch.long) if plans.stratum is None else plans.stratum.cpu().long()
+
+
+def _uneven(number: Tensor, block: Tensor, label: Tensor, names: list[str], item: str) -> str:
+    """A note where units have far more behaviours under one condition than under another; "" where they do not.
+
+    Args:
+        number: `[N]`: the behaviours of each plan.
+        block: `[N]`: its block; -1: it is left out.
+        label: `[B]`: the condition of each block.
+        names: of the conditions.
+        item: "subjects" or "sequences".
+    """
+    kept, sizes = block >= 0, label.bincount(minlength=len(names))
+    if int((sizes > 0).sum()) < 2:
+        return ""
+    means = label[block[kept]].bincount(number[kept].double(), minlength=len(names)) / sizes
+    least, most = (int(place) for place in (means.argmin(), means.argmax()))
+    if means[most] <= MAX_UNEVEN * means[least]:
+        return ""
+    return (
+        f"Under {names[most]} there are {float(means[most] / means[least]):.2g} times as many behaviours per"
+        f" {item.removesuffix('s')} as under {names[least]}: where groups differ so much in size and in noise, one test in ten may find a"
+        " difference that is none."
+    )
 
 
 def _reason(kind: Kind, item: str, under: Tensor, names: list[str]) -> str:

@@ -91,11 +91,16 @@ def test_by_hand():
     assert {m.actions for m in found[:4]} == {(0, 1, 0), (2, 1, 2), (0, 1, 2), (2, 1, 0)}
 
 
+def unlike(number: int) -> torch.Tensor:
+    """Plans of two chains by turns: they differ by more than chance."""
+    chains = torch.tensor([[[0.9, 0.1], [0.6, 0.4]], [[0.2, 0.8], [0.1, 0.9]]]).double()
+    parts = [markov_plans(chain, number // 2, 40, seed).actions for seed, chain in enumerate(chains)]
+    return torch.stack(parts, 1).flatten(0, 1)
+
+
 def test_the_interval_is_that_of_the_delta_method():
     """Over plans, each with its residual; against the closed form and, within a tenth, a bootstrap over plans."""
-    probs = torch.tensor([[0.7, 0.3], [0.4, 0.6]]).double()
-    plans = markov_plans(probs, 30, 40, 0)
-    word = (0, 1, 1)
+    plans, word = Plans(unlike(30), 2), (0, 1, 1)
     found = next(m for m in motifs(plans, (3,)) if m.actions == word)
     rows = [brute_force(plans[i : i + 1], 3).get(word, (0, 0, 0, 0)) for i in range(30)]
     units = torch.tensor(rows).double()
@@ -106,6 +111,7 @@ def test_the_interval_is_that_of_the_delta_method():
     sums = units.sum(0)
     shift = units[:, 0] / sums[0] + units[:, 1] / sums[1] - units[:, 2] / sums[2] - units[:, 3] / sums[3]
     half = stats.t.ppf(0.975, 29) * math.sqrt(30 / 29 * float((shift**2).sum()))
+    assert half > 1.96 * math.sqrt(float((1 - sums[2] / sums[1]) * (1 - sums[3] / sums[1]) / sums[0]))
     assert found.low == pytest.approx(found.ratio * math.exp(-half))
     assert found.high == pytest.approx(found.ratio * math.exp(half))
     drawn = units[torch.randint(30, (4000, 30), generator=seeded(0))].sum(1)
@@ -119,7 +125,7 @@ def halves(plans: Plans) -> float:
 
 
 def test_the_units_of_the_interval():
-    actions = markov_plans(torch.tensor([[0.7, 0.3], [0.4, 0.6]]).double(), 30, 40, 0).actions
+    actions = unlike(30)
     by_plan = halves(Plans(actions, 2))
     assert halves(Plans(actions, 2, group=torch.zeros(30).long())) == by_plan
     assert halves(Plans(actions, 2, group=torch.arange(30) * 7)) == by_plan
@@ -128,7 +134,7 @@ def test_the_units_of_the_interval():
     doubled = Plans(actions.repeat_interleave(2, 0), 2, group=torch.arange(30).repeat_interleave(2))
     assert halves(doubled) == pytest.approx(by_plan)
     # More than 40 units are joined in order: 80 plans in pairs.
-    many = markov_plans(torch.tensor([[0.7, 0.3], [0.4, 0.6]]).double(), 2 * BLOCKS, 40, 0).actions
+    many = unlike(2 * BLOCKS)
     joined = Plans(many, 2, group=torch.arange(2 * BLOCKS) // 2)
     assert halves(Plans(many, 2)) == pytest.approx(halves(joined))
 
@@ -145,8 +151,10 @@ def test_intervals_without_spread_or_without_counts():
     """`0 1 0` and `2 1 2` alone occur: the others never do; all plans of a kind are equal."""
     actions = torch.tensor([[0, 1, 0], [2, 1, 2]]).repeat(20, 1)
     found = {m.actions: m for m in motifs(Plans(actions, 3, group=torch.arange(40) // 2), (3,))}
-    assert found[0, 1, 0].low == pytest.approx(2)
-    assert found[0, 1, 0].high == pytest.approx(2)
+    # Units agree; the count is hypergeometric: half of the heads and half of the tails are others.
+    half = stats.norm.ppf(0.975) * math.sqrt(0.5 * 0.5 / 20)
+    assert found[0, 1, 0].low == pytest.approx(2 * math.exp(-half))
+    assert found[0, 1, 0].high == pytest.approx(2 * math.exp(half))
     absent = found[0, 1, 2]
     assert (absent.count, absent.ratio, absent.low) == (0, 0, 0)
     assert stats.poisson.pmf(0, absent.high * absent.expected) == pytest.approx(0.025)

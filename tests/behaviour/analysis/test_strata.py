@@ -334,3 +334,13 @@ def test_where_an_interaction_cannot_be_tested_there_is_none():
     # With conditions 0 and 1 in one stratum, 1 and 2 in the other there is no difference to compare.
     apart = stratified([[0], [1]] * 3 + [[1], [2]] * 3, [0] * 6 + [1] * 6)
     assert compare_conditions(apart, 99, seeded(0)).interaction is None
+
+
+@pytest.mark.parametrize(("shorter", "noted"), [(20, False), (9, True)])
+def test_groups_of_far_more_behaviours_are_noted(shorter, noted):
+    """Of thirty behaviours under one condition, and fewer under the other."""
+    plans = stratified([[0], [1], [0], [1], [0], [1], [1]], [0] * 7, length=30)
+    lengths = torch.where(plans.condition == 1, shorter, 30)
+    notes = compare_conditions(replace(plans, lengths=lengths), 99, seeded(0)).design.notes
+    assert [note for note in notes if "3.3 times as many behaviours" in note] == [*notes]
+    assert len(notes) == noted
