@@ -231,8 +231,8 @@ def _uneven(number: Tensor, block: Tensor, label: Tensor, names: list[str], item
         return ""
     return (
         f"Under {names[most]} there are {float(means[most] / means[least]):.2g} times as many behaviours per"
-        f" {item.removesuffix('s')} as under {names[least]}: where groups differ so much in size and in noise, one test in ten may find a"
-        " difference that is none."
+        f" {item.removesuffix('s')} as under {names[least]}: where groups differ so much in size and in noise, one test"
+        " in ten may find a difference that is none."
     )
 
 
