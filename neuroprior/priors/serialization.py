@@ -45,7 +45,7 @@ def save(prior: SavedModule, folder: str | os.PathLike[str]) -> Path:
 
     Raises:
         OSError: the folder cannot be written.
-        ValueError: it is no prior.
+        ValueError: it is no prior, or the folder has no name.
 
     Example:
         >>> sorted(path.name for path in save(MarkovPrior(3, order=2), "runs/markov").iterdir())
@@ -53,7 +53,7 @@ def save(prior: SavedModule, folder: str | os.PathLike[str]) -> Path:
     """
     if not isinstance(prior, SavedModule):
         raise ValueError(f"`prior` must be a Prior, got {type(prior).__name__}")
-    folder = Path(folder)
+    folder = _folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
     data = written_state(prior)
     config = {
@@ -100,9 +100,7 @@ def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu", *, 
         >>> load(folder).order
         2
     """
-    if not isinstance(folder, str | os.PathLike):
-        raise ValueError(f"`folder` must be the name of a folder, got {type(folder).__name__}")
-    folder = Path(folder)
+    folder = _folder(folder)
     config = _read_config(folder / "config.json")
     if not isinstance(kind, type):
         raise ValueError(f"`kind` must be a class such as Prior, got {kind!r}")
@@ -166,6 +164,14 @@ def _size(config: dict[str, Any]) -> int:
         # It computes with its numbers, which are not there; it holds one at least for each action.
         actions = config["config"].get("num_actions")
         return actions if isinstance(actions, int) else 0
+
+
+def _folder(folder: object) -> Path:
+    """The path of a folder; ValueError for an empty name, which would be that of the present folder."""
+    if not isinstance(folder, str | os.PathLike) or not os.fspath(folder).strip():
+        got = repr(folder) if isinstance(folder, str) else type(folder).__name__
+        raise ValueError(f"`folder` must be the name of a folder, got {got}")
+    return Path(folder)
 
 
 def _read_config(path: Path) -> dict[str, Any]:

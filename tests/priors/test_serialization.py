@@ -317,3 +317,13 @@ def test_a_configuration_cannot_ask_for_more_than_the_file_holds(make, tmp_path)
     place.write_text(place.read_text().replace('"num_actions": 3', '"num_actions": 1000000000000'))
     with pytest.raises(ValueError, match="would need at least"):
         load(folder)
+
+
+@pytest.mark.parametrize("folder", ["", " ", 3, None])
+def test_a_folder_has_a_name(folder, tmp_path, monkeypatch):
+    """Without one a prior would be written among the files of the present folder."""
+    monkeypatch.chdir(tmp_path)
+    for call in (lambda: save(MarkovPrior(2, 0), folder), lambda: load(folder)):
+        with pytest.raises(ValueError, match="`folder` must be the name of a folder, got"):
+            call()
+    assert not list(tmp_path.iterdir())
