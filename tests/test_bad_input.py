@@ -17,7 +17,6 @@ from neuroprior import (
     fit,
     load,
     oracle,
-    read_plans,
     save,
     write_plans,
 )
@@ -47,12 +46,11 @@ def test_names_are_texts_and_distinct(what, names, says):
         RecordedPlans(ACTIONS, 2, **numbers, **{f"{what}_names": names})
 
 
-def test_numbers_of_actions(tmp_path):
+def test_numbers_of_actions():
     with refuses("num_actions", "True"):
         Plans(ACTIONS, True)
-    np.savez(tmp_path / "a.npz", actions=np.array([[0, 2**62]]))
-    with refuses("a.npz", "number the actions from 0"):
-        read_plans(tmp_path / "a.npz")
+    with refuses("number the actions from 0"):
+        Plans(ACTIONS, 2**32)
 
 
 def test_weights_that_are_no_numbers(tmp_path):
@@ -162,6 +160,9 @@ def test_numbers_of_numpy_are_numbers():
     [
         (["report", "FILE", "--columns.acton", "x"], ["columns.acton"]),
         (["fit", "FILE", "--config", "markov", "--prior.hidden", "8"], ["prior", "'hidden'"]),
+        (["fit", "FILE", "--prior=markof"], ["`prior` must be one of combined, uniform, markov", "got markof"]),
+        (["fit", "FILE", "--prior=markov", "--effort", "fast"], ["`effort` must be left out", "got fast"]),
+        (["fit", "FILE", "--prior", "mixture", "--effort=full"], ["`effort` must be left out", "got full"]),
         (["sample", "PRIOR", "--seed", str(2**70)], ["seed", "2**63"]),
         (["score", "PRIOR", "FILE", "--out", "OUT"], ["at least two held-out actions"]),
     ],

@@ -5,6 +5,7 @@ from copy import deepcopy
 from dataclasses import fields, replace
 from functools import partial
 from importlib.resources import files
+from inspect import signature
 from pathlib import Path
 from typing import Any, Literal
 
@@ -99,10 +100,10 @@ def run(arguments: list[str]) -> None:
 
 def _with_classes(arguments: list[str]) -> list[str]:
     """Return the arguments with names of priors, such as gru, as the classes or functions that make them."""
-    places = [number for number, before in enumerate(arguments, 1) if before == "--prior" and number < len(arguments)]
-    made = list(arguments)
+    made = [word for one in arguments for word in (one.split("=", 1) if one.startswith("--prior=") else [one])]
+    places = [number for number, before in enumerate(made, 1) if before == "--prior" and number < len(made)]
     for place in places:
-        name = arguments[place]
+        name = made[place]
         if name.isidentifier() and PRIORS.find(name) is None and SavedModule.known.find(name) is None:
             raise ValueError(f"`prior` must be one of {', '.join(PRIORS)}, or a class, got {name}.")
         if (kind := PRIORS.find(name)) is not None:
@@ -168,6 +169,12 @@ def fit(
         reading: how files are read.
     """
     folder, generator = Path(resume or out), torch.Generator().manual_seed(seed)
+    make: Callable[..., Prior] = prior
+    if effort is not None:
+        # Of a class that the command line names, its arguments stand among those that are given already.
+        if "effort" not in {*signature(prior).parameters, *getattr(prior, "keywords", ())}:
+            raise ValueError(f"`effort` must be left out for another prior than the combined one, got {effort}.")
+        make = partial(make, effort=effort)
     with claim(folder, owns_all=True, name="out" if resume is None else "resume"):
         if resume is None:
             _check_new(folder, options)
@@ -182,14 +189,9 @@ def fit(
         ended = source.with_end() if end and source.end is None else source
         parts = divide(ended, validation, held_out, folds, past_durations, seed)
         training = replace(training, validation=validation)
-        arguments: dict[str, Any] = {} if effort is None else {"effort": effort}
         try:
-            made = make_prior(parts.plans, partial(prior, **arguments), use_context)
+            made = make_prior(parts.plans, make, use_context)
         except TypeError as error:
-            if "'effort'" in str(error):
-                raise ValueError(
-                    f"`effort` must be left out for another prior than the combined one, got {effort}."
-                ) from error
             raise ValueError(
                 f"`prior` must take what it is given: {error}; --use_context false leaves the context out."
             ) from error

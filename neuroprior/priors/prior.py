@@ -225,7 +225,10 @@ class Prior(SavedModule):
         if plans.device.type == "cpu":  # as in `check_step`
             check_range("plans", plans, self.num_actions, "actions")
             self.check_context_of(context, *plans.shape)
-        context = None if context is None else expand_context(context, plans.shape[1])
+        if context is not None:
+            context = expand_context(context, plans.shape[1])
+            if context.shape[:2] != plans.shape:
+                raise ValueError(f"`context` must be one a step, {list(plans.shape)}, got {list(context.shape)}")
         return check_logits(super().__call__(plans, context), [*plans.shape, self.num_actions], "forward")
 
     def log_prob(self, plans: Plans | Tensor) -> Tensor:

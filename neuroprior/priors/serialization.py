@@ -62,8 +62,8 @@ def save(prior: SavedModule, folder: str | os.PathLike[str]) -> Path:
 
     Raises:
         OSError: the folder cannot be written.
-        ValueError: it is no prior, `load` could not make it again (its weights are infinite, say), or a run of
-            `neuroprior fit` uses the folder.
+        ValueError: it is no prior, `load` could not make it again (its weights are infinite, say), the folder has no
+            name, or a run of `neuroprior fit` uses it.
 
     Example:
         >>> sorted(path.name for path in save(MarkovPrior(3, order=2), "runs/markov").iterdir())
@@ -92,7 +92,7 @@ def model_bytes(prior: SavedModule) -> bytes:
 
 def write_model(data: bytes, folder: str | os.PathLike[str]) -> Path:
     """Write what `model_bytes` returned to a folder."""
-    folder = Path(folder)
+    folder = _folder(folder)
     with claim(folder, name="folder", seconds=SECONDS):
         write_whole(folder / MODEL, data)
         write_whole(folder / CONFIG, (json.dumps(_content_of(data), indent=2) + "\n").encode())
@@ -126,11 +126,9 @@ def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu", *, 
         >>> load(folder).order
         2
     """
-    if not isinstance(folder, str | os.PathLike):
-        raise ValueError(f"`folder` must be the name of a folder, got {type(folder).__name__}")
+    folder = _folder(folder)
     if not isinstance(kind, type):
         raise ValueError(f"`kind` must be a class such as Prior, got {kind!r}")
-    folder = Path(folder)
     data = (folder / MODEL).read_bytes()
     content, tensors = _in_file(folder / MODEL, lambda: _read(data))
     if (folder / CONFIG).exists():  # not yet there, or that of the model before, while or where a save was cut off
@@ -264,6 +262,14 @@ def _is_sound(value: Tensor, logs: bool) -> bool:
     if not value.is_floating_point() or bool(value.isfinite().all()):
         return True
     return logs and not bool((value.isnan() | (value == inf)).any() | (value == -inf).all(-1).any())
+
+
+def _folder(folder: object) -> Path:
+    """The path of a folder; ValueError for an empty name, which would be that of the present folder."""
+    if not isinstance(folder, str | os.PathLike) or not os.fspath(folder).strip():
+        got = repr(folder) if isinstance(folder, str) else type(folder).__name__
+        raise ValueError(f"`folder` must be the name of a folder, got {got}")
+    return Path(folder)
 
 
 def _names(prior: SavedModule, attribute: str) -> set[str]:

@@ -373,3 +373,13 @@ def test_beside_one_another_writers_and_a_reader_have_whole_models(tmp_path):
     assert min(counts[type(prior)] for prior in made) > 0
     assert {path.name for path in folder.iterdir()} == {"model.safetensors", "config.json"}
     assert content_of(folder) == serialization._content_of((folder / "model.safetensors").read_bytes())
+
+
+@pytest.mark.parametrize("folder", ["", " ", 3, None])
+def test_a_folder_has_a_name(folder, tmp_path, monkeypatch):
+    """Without one a prior would be written among the files of the present folder."""
+    monkeypatch.chdir(tmp_path)
+    for call in (lambda: save(MarkovPrior(2, 0), folder), lambda: load(folder)):
+        with pytest.raises(ValueError, match="`folder` must be the name of a folder, got"):
+            call()
+    assert not list(tmp_path.iterdir())

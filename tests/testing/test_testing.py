@@ -206,6 +206,29 @@ def test_integers_out_of_range_are_refused_by_a_prior(name: str) -> None:
             prior.step(wrong, state)
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("name", PRIORS)
+def test_a_prior_that_is_called_reads_plans_as_log_prob_does(name: str) -> None:
+    prior = PRIORS[name]()
+    generator = torch.Generator().manual_seed(0)
+    plans = torch.randint(min(prior.num_actions, 100), (5, 4), generator=generator)
+    context = random_context(prior, 5, 4, generator)
+    with pytest.raises(ValueError, match="`plans` must be integers"):
+        prior(plans[0], context)
+    with pytest.raises(ValueError, match="`plans` must be integers"):
+        prior(plans.double(), context)
+    with pytest.raises(ValueError, match="context"):
+        prior(plans, plans if context is None else None)
+    if context is not None:
+        with pytest.raises(ValueError, match="context"):
+            prior(plans, context[:4])
+        with pytest.raises(ValueError, match="context"):
+            prior(plans, context[:, :3])
+    if context is not None and prior.num_patterns is None:
+        each = context[:, :1].expand(context.shape)
+        assert prior(plans, context[:, 0]).equal(prior(plans, each))
+
+
 @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float64])
 @pytest.mark.parametrize("name", [name for name in PRIORS if name.endswith("features")])
 def test_features_of_every_kind_are_read_in_single_precision(name: str, kind: torch.dtype) -> None:
