@@ -13,12 +13,11 @@ from threading import Thread
 import pytest
 import torch
 from safetensors.torch import load as read_tensors
-from safetensors.torch import save as write_tensors
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior, UniformPrior, load, save
 from neuroprior.priors import Prior, StackedPrior, serialization
 from neuroprior.priors.saved import SavedModule
-from tests.support.saved import SAVED
+from tests.support.saved import SAVED, content_of, rewrite
 from tests.support.sources import refuses, says, seeded
 
 A = 3
@@ -102,21 +101,6 @@ def folder(request, tmp_path):
     if request.param == "markov":
         prior = MarkovPrior(A, 2).fit(torch.randint(A, (40, 4), generator=seeded(0)))
     return save(prior, tmp_path / "model")
-
-
-def content_of(folder):
-    return json.loads((folder / "config.json").read_text())
-
-
-def rewrite(folder, content, tensors=None):
-    """Write a model with another configuration or other tensors, and the checksums that belong to them."""
-    data = (folder / "model.safetensors").read_bytes()
-    tensors = read_tensors(data) if tensors is None else tensors
-    content = content | {"weights": serialization._checksum_of(tensors)}
-    if set(serialization.ENTRIES) <= set(content):
-        content["sha256"] = serialization._checksum(content)
-    (folder / "config.json").write_text(json.dumps(content))
-    (folder / "model.safetensors").write_bytes(write_tensors(tensors, {"neuroprior": json.dumps(content)}))
 
 
 def refused(folder, *words, error=ValueError):

@@ -1,23 +1,43 @@
-"""Priors of every kind that can be saved, after a short fit."""
+"""Priors of every kind that can be saved, after a short fit; models that say something else than was saved."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from math import inf
+from pathlib import Path
+from typing import Any
 
 import torch
+from safetensors.torch import load as read_tensors
+from safetensors.torch import save as write_tensors
 
 from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, TransformerPrior, UniformPrior
 from neuroprior.behaviour.durations.duration_model import DurationModel
 from neuroprior.behaviour.durations.semi_markov import SemiMarkovPrior
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.control import AutoregressivePrior, NoisePrior, StoredWindows, VectorGRU, VectorPlans
-from neuroprior.priors import AdaptivePrior, ContextTreePrior, MixturePrior, StackedPrior, SwitchingPrior
+from neuroprior.priors import AdaptivePrior, ContextTreePrior, MixturePrior, StackedPrior, SwitchingPrior, serialization
 from neuroprior.priors.saved import SavedModule
 from neuroprior.puzzles import LogLinearPrior
 from tests.support.sources import seeded
 
 QUICK = {"max_steps": 3, "progress": False}
 BOUNDS = ([-1.0, -2.0], [1.0, 3.0])
+
+
+def content_of(folder: Path) -> dict[str, Any]:
+    """What `config.json` says of a saved prior."""
+    content: dict[str, Any] = json.loads((folder / "config.json").read_text())
+    return content
+
+
+def rewrite(folder: Path, content: dict[str, Any], tensors: dict[str, torch.Tensor] | None = None) -> None:
+    """Write a model with another configuration or other tensors, and the checksums that belong to them."""
+    tensors = read_tensors((folder / "model.safetensors").read_bytes()) if tensors is None else tensors
+    content = content | {"weights": serialization._checksum_of(tensors)}
+    content["sha256"] = serialization._checksum(content)
+    (folder / "config.json").write_text(json.dumps(content))
+    (folder / "model.safetensors").write_bytes(write_tensors(tensors, {"neuroprior": json.dumps(content)}))
 
 
 def _plans(context: torch.Tensor | None = None, num: int = 60) -> Plans:

@@ -18,6 +18,7 @@ from neuroprior.control import (
 )
 from neuroprior.priors import MarkovPrior, load, save
 from neuroprior.testing import check_prior
+from tests.support.saved import content_of, rewrite
 from tests.support.sources import seeded
 from tests.support.vectors import Drift
 
@@ -277,9 +278,10 @@ def test_folders_say_what_they_hold(tmp_path):
         load(tmp_path / "actions", kind=VectorPrior)
     with pytest.raises(ValueError, match="kind"):
         load(tmp_path / "actions", kind="other")
-    text = (tmp_path / "vectors" / "config.json").read_text()
-    (tmp_path / "vectors" / "config.json").write_text(text.replace('"memory": ', '"memory": 1000000000'))
-    with pytest.raises(ValueError, match=r"config\.json|does not fit"):
+    content = content_of(tmp_path / "vectors")
+    content["learned"]["memory"] = 10**9
+    rewrite(tmp_path / "vectors", content)
+    with pytest.raises(ValueError, match=r"memory: 1000000000 would need at least"):
         load(tmp_path / "vectors", kind=VectorPrior)
 
 

@@ -1,6 +1,5 @@
 """The combined prior: its bound, the pool's powers, initial weights against a search, which experts are kept."""
 
-import json
 import math
 from functools import cache, partial
 
@@ -29,6 +28,7 @@ from neuroprior.priors.counts import BACKOFFS_TRIED, Chains, TooLargeError
 from neuroprior.priors.ensembles.candidates import OF_EFFORT, ORDERS, best_chain
 from neuroprior.priors.ensembles.pooling import HeldOut
 from neuroprior.testing import check_prior
+from tests.support.saved import content_of, rewrite
 from tests.support.sources import every_plan, refuses, seeded
 
 A, C = 3, 4
@@ -278,10 +278,10 @@ def test_all_given_experts_are_saved_for_the_next_fit(tmp_path):
     assert prior.learned == again.learned
     assert [UniformPrior] == [type(e) for e in prior.experts]
     assert prior.log_prob(random).equal(again.log_prob(random))
-    saved = json.loads((folder / "config.json").read_text())
+    saved = content_of(folder)
     saved["learned"]["given"][0] = 9
-    (folder / "config.json").write_text(json.dumps(saved))
-    with refuses("config.json", "`given` must be the numbers of 4 experts"):
+    rewrite(folder, saved)
+    with refuses("model.safetensors", "`given` must be the numbers of 4 experts"):
         load(folder)
 
 
