@@ -1,14 +1,16 @@
 """Each option of how files are read changes what is read, and nothing else: a table of the options themselves."""
 
 import io
+import re
 from dataclasses import fields
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 from jsonargparse import ArgumentParser
 
-from neuroprior.behaviour import read
+from neuroprior.behaviour import Recordings, read
 from neuroprior.behaviour.reading import Columns, Options
 from neuroprior.cli.reading import SPELLED, add_reading_arguments, pop_reading, reading_words
 
@@ -73,15 +75,20 @@ CASES: dict[str, tuple[str, str, list[int], dict[str, list[Any]]]] = {
 }  # fmt: skip
 
 
-def events(table: str, options: str) -> pd.DataFrame:
-    """The events that a table is read as, with options as a command line has them; without any where it is refused."""
+def recordings(table: str, options: str) -> Recordings:
+    """What a table is read as, with options as a command line has them."""
     parser = ArgumentParser(exit_on_error=False)
     add_reading_arguments(parser, Options)
     reading = pop_reading(parser.parse_args(options.split()).as_dict(), Options)
     assert pop_reading(parser.parse_args(reading_words(reading)).as_dict(), Options) == reading
     frame = pd.read_csv(io.StringIO(table), dtype=str, keep_default_na=False)
+    return read(frame, **{field.name: getattr(reading, field.name) for field in fields(Options)})
+
+
+def events(table: str, options: str) -> pd.DataFrame:
+    """The events of a table; none where it is refused."""
     try:
-        return read(frame, **{field.name: getattr(reading, field.name) for field in fields(Options)}).events
+        return recordings(table, options).events
     except ValueError:
         return pd.DataFrame()
 
@@ -103,3 +110,23 @@ def test_an_option_changes_what_it_says_and_nothing_else(option):
     expected = without.iloc[left].reset_index(drop=True).assign(**changes)
     assert not expected.equals(without)
     pd.testing.assert_frame_equal(found[sorted(found)], expected[sorted(expected)], check_dtype=False)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    ("table", "options"),
+    [(BOUTS, SESSIONS), (TWICE, f"{STOPS} --overlaps keep"), (DAYS, f"{BASE} --day_first true"), (LONG, BASE)],
+    ids=["bouts", "twice", "days", "long"],
+)
+def test_rows_in_another_order_are_the_same_recordings_with_the_same_notes(table, options, seed):
+    """Beside the note that they are in another order, and the number of the row that a note names."""
+    lines = table.splitlines()
+    order = np.random.default_rng(seed).permutation(len(lines) - 1)
+    first, other = recordings(table, options), recordings("\n".join([lines[0], *np.array(lines[1:])[order]]), options)
+    assert sorted_events(other.events).equals(sorted_events(first.events))
+    notes = [{re.sub(r" \(first in [^)]*\)", "", note) for note in one.notes} for one in (first, other)]
+    assert notes[0] ^ notes[1] <= {"rows are not in the order of time, and are sorted by it"}
+
+
+def sorted_events(events: pd.DataFrame) -> pd.DataFrame:
+    return events.sort_values(["recording", "subject", "start"]).reset_index(drop=True)
