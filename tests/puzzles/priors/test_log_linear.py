@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from neuroprior import MarkovPrior, MCTSPlanner, Plans, SamplingPlanner, World, collect, read_plans, write_plans
 from neuroprior.priors import load, save
 from neuroprior.puzzles import LogLinearPrior, Steps
+from neuroprior.puzzles.priors.compiled_fit import frequent, number_patterns
 from neuroprior.sampling.ancestral import sample_in_world
 from neuroprior.testing import check_world
 from neuroprior.worlds import Patterns
@@ -233,3 +235,15 @@ def test_settings_out_of_range_are_refused_and_change_nothing(settings: dict[str
 def test_bad_input_is_refused(call: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.parametrize(("number", "kinds"), [(300, 40), (70_000, 100_000)])
+def test_frequent_patterns_are_those_of_numpy(number, kinds):
+    """Also where there are more kinds than the first table has room for."""
+    patterns = np.random.default_rng(0).integers(0, kinds, (number, 3)) ** 2 % (2**31 - 1)
+    codes, counts = np.unique(patterns, return_counts=True)
+    found = frequent(patterns.astype(np.int32), 3)
+    assert found.tolist() == codes[counts >= 3].tolist()
+    rows = number_patterns(found, patterns[:50].astype(np.int32))
+    known = {code: row for row, code in enumerate(found.tolist())}
+    assert rows.tolist() == [[known.get(code, len(found)) for code in row] for row in patterns[:50].tolist()]
