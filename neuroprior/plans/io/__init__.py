@@ -99,7 +99,8 @@ def write_plans(plans: Plans, path: str | os.PathLike[str]) -> None:
     `.npz` keeps everything, also what a subclass of `Plans` adds; `.jsonl` all that `Plans` have. CSV, with one plan a
     row, holds no context that changes within plans. It keeps names where there are any, else numbers, but not how many
     actions are possible: give `num_actions` or `action_names` when reading it. Names of contexts and groups are
-    numbered in sorted order then.
+    numbered in sorted order then. Before a name that a spreadsheet would take for a formula, as one that begins with =,
+    stands an apostrophe, which `read_plans` leaves out.
 
     Args:
         plans: at least one.
