@@ -71,7 +71,7 @@ def test_pursuit_goes_on_from_where_the_last_plan_ended() -> None:
         assert int(world.cell(now[start])) != t.goal
         before = now[start].clone()
         for action in plan[:length]:
-            now[start] = world.step(now[start], action.long())[0]
+            now[start] = world.step(now[start][None], action[None])[0][0]
         assert int(now[start]) != int(before), "a plan that ends where it began was kept"
     assert now.equal(done.final_state)
     assert done.reached.equal(world.cell(now) == t.goal)
