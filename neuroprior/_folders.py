@@ -32,14 +32,22 @@ class Claim:
         folder: its path.
     """
 
-    def __init__(self, folder: Path, replaces: bool, owns_all: bool) -> None:
-        self.folder, self._replaces, self._owns_all, self._times = folder, replaces, owns_all, 1
+    def __init__(self, folder: Path, replaces: bool, owns_all: bool, command: str) -> None:
+        self.folder, self._replaces, self._owns_all, self._command = folder, replaces, owns_all, command
+        self._times = 1
 
     def check(self, names: Iterable[str]) -> None:
-        """Raise ValueError if a file of one of these names is there, and no earlier run wrote it as a result."""
-        known = self._known()
+        """Raise ValueError if a file of one of these names is there, and no earlier run wrote it as a result.
+
+        Results of another command are those of somebody who may want to keep them.
+        """
+        known, command = self._known()
+        if self._command and command not in ("", self._command) and any(map(self._is_there, known)):
+            raise ValueError(
+                f"`out` must be a folder without results of another command, got {self.folder}: {command}."
+            )
         for name in names:
-            if name not in known and not self._owns_all and os.path.lexists(self.folder / name):
+            if name not in known and not self._owns_all and self._is_there(name):
                 raise ValueError(
                     f"`out` must be a folder without {name}, or with that of an earlier run, got {self.folder}."
                 )
@@ -57,21 +65,32 @@ class Claim:
         if not names or self._owns_all:
             return
         self.check(names)
-        known = self._known()
+        known, _ = self._known()
         if self._replaces:
             self._replaces = False
             for name in known:
                 (self.folder / name).unlink(missing_ok=True)
             known = set()
         if not names <= known:
-            content = json.dumps({"files": sorted(known | names)}, indent=2) + "\n"
+            content = json.dumps({"command": self._command, "files": sorted(known | names)}, indent=2) + "\n"
             write_whole(self.folder / FILES, content.encode())  # before the files: whoever is killed then owns them
 
-    def _known(self) -> set[str]:
+    def _is_there(self, name: str) -> bool:
+        return os.path.lexists(self.folder / name)
+
+    def _known(self) -> tuple[set[str], str]:
+        """The results that are there by the list in the folder, and the command that wrote them."""
         with suppress(OSError, ValueError, KeyError, TypeError):
-            files = read_json(self.folder / FILES)["files"]
-            return {name for name in files if isinstance(name, str) and Path(name).name == name}
-        return set()
+            content = read_json(self.folder / FILES)
+            files = {name for name in content["files"] if isinstance(name, str) and is_inside(name)}
+            return files, str(content["command"])
+        return set(), ""
+
+
+def is_inside(name: str) -> bool:
+    """Whether a name is that of a file in a folder, or in a folder of it."""
+    path = Path(name)
+    return not path.is_absolute() and ".." not in path.parts and len(path.parts) in (1, 2)
 
 
 _claims = threading.local()
@@ -79,7 +98,13 @@ _claims = threading.local()
 
 @contextmanager
 def claim(
-    folder: Path, *, replaces: bool = False, owns_all: bool = False, name: str = "out", seconds: float = SECONDS
+    folder: Path,
+    *,
+    replaces: bool = False,
+    owns_all: bool = False,
+    command: str = "",
+    name: str = "out",
+    seconds: float = SECONDS,
 ) -> Iterator[Claim]:
     """Claim a folder, which is made if need be; the thread that has claimed it may do so again, and shares its claim.
 
@@ -89,6 +114,7 @@ def claim(
         folder: where.
         replaces: the results of this run are to take the place of those of earlier ones, see `Claim.add`.
         owns_all: everything in the folder is the run's own.
+        command: whose results these are; those of another command are not replaced.
         name: of the argument, for the message.
         seconds: for which to wait until another run has released the folder.
 
@@ -106,7 +132,7 @@ def claim(
         return
     made = [one for one in (Path(place), *Path(place).parents) if not one.exists()]
     descriptor = _lock(Path(place), folder, name, seconds)
-    claims[place] = Claim(folder, replaces, owns_all)
+    claims[place] = Claim(folder, replaces, owns_all, command)
     try:
         clear(Path(place))
         yield claims[place]
@@ -132,7 +158,9 @@ def claim_out(function: F) -> F:
         bound = signature.bind(*given, **named)
         bound.apply_defaults()
         out = bound.arguments["out"]
-        with nullcontext() if out is None else claim(Path(out), replaces=True):
+        if out is not None and not os.fspath(out).strip():
+            raise ValueError(f"`out` must be the name of a folder, got {out!r}.")
+        with nullcontext() if out is None else claim(Path(out), replaces=True, command=function.__name__):
             return function(*given, **named)
 
     return cast(F, claiming)

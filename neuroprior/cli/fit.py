@@ -168,6 +168,8 @@ def fit(
         options: the options in YAML, to be kept in the folder.
         reading: how files are read.
     """
+    if not out.strip():
+        raise ValueError(f"`out` must be the name of a folder, got {out!r}.")
     folder, generator = Path(resume or out), torch.Generator().manual_seed(seed)
     make: Callable[..., Prior] = prior
     if effort is not None:

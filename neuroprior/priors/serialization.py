@@ -94,6 +94,8 @@ def write_model(data: bytes, folder: str | os.PathLike[str]) -> Path:
     """Write what `model_bytes` returned to a folder."""
     folder = _folder(folder)
     with claim(folder, name="folder", seconds=SECONDS):
+        if (folder / CONFIG).exists() and not (folder / MODEL).exists():
+            raise ValueError(f"`folder` must be one without the {CONFIG} of something else, got {folder}.")
         write_whole(folder / MODEL, data)
         write_whole(folder / CONFIG, (json.dumps(_content_of(data), indent=2) + "\n").encode())
     return folder

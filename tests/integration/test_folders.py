@@ -17,7 +17,9 @@ from neuroprior import MarkovPrior, UniformPrior, load, save
 from neuroprior.__main__ import main
 from neuroprior._files import clear, replacing, write_whole
 from neuroprior._folders import claim
+from neuroprior.behaviour import RecordedPlans, simulated_study
 from neuroprior.plans import write_plans
+from neuroprior.plans.io.npz import read_npz
 from tests.integration.test_train import ROOT, some_plans
 from tests.support.sources import refuses
 
@@ -206,3 +208,44 @@ def test_a_model_that_was_saved_over_a_run_is_not_its_own(tmp_path):
     save(MarkovPrior(3, 1).fit(torch.zeros(4, 5, dtype=torch.long)), run)
     assert main(["fit", "--resume", str(run)]) == 0
     assert (run / "model.safetensors").read_bytes() == before
+
+
+def test_results_of_another_command_are_kept(tmp_path, monkeypatch, capsys):
+    """And a folder has a name: without one, results would be written among the files of the present folder."""
+    monkeypatch.chdir(tmp_path)
+    plans = some_plans()
+    write_plans(plans, "plans.npz")
+    save(MarkovPrior(plans.num_actions, 1).fit(plans.without_context()), "model")
+    quick = ["plans.npz", "--models", "counts", "--folds", "2", "--processes", "1"]
+    assert main(["report", *quick, "--figures", "svg", "--out", "kept"]) == 0
+    before = {path.name for path in Path("kept").iterdir()}
+    capsys.readouterr()
+    assert main(["score", "model", "plans.npz", "--out", "kept"]) == 2
+    assert "without results of another command, got kept: report" in capsys.readouterr().err
+    assert {path.name for path in Path("kept").iterdir()} == before
+    assert list(Path("kept/figures").glob("*.svg"))
+    assert main(["report", *quick, "--out", "kept"]) == 0
+    assert not list(Path("kept/figures").glob("*.svg"))  # they were of the run before
+    for command in (["score", "model", "plans.npz"], ["report", *quick], ["fit", "plans.npz"]):
+        capsys.readouterr()
+        assert main([*command, "--out", ""]) == 2
+        assert "`out` must be the name of a folder, got ''" in capsys.readouterr().err
+
+
+def test_a_config_of_something_else_is_not_replaced(tmp_path):
+    (tmp_path / "config.json").write_text('{"my": "settings"}')
+    with refuses("`folder`", "config.json of something else"):
+        save(UniformPrior(3), tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
+
+
+def test_a_run_on_recordings_with_times_goes_on(tmp_path, monkeypatch):
+    """Plans with all that recordings have, marks of bouts that were cut off among them, are read back."""
+    monkeypatch.chdir(tmp_path)
+    simulated_study(0, animals=4, actions=40).to_csv("study.csv", index=False)
+    assert main(["fit", "study.csv", "--prior", "markov", "--out", "run"]) == 0
+    (Path("run") / "learned.json").unlink(missing_ok=True)
+    assert main(["fit", "--resume", "run"]) == 0
+    plans = read_npz(Path("run/plans.npz"), None, None, RecordedPlans)
+    assert plans.cut_off.any()
+    assert not plans.cut_off.all()

@@ -166,9 +166,11 @@ def report(
 
 
 def _write(document: Document, folder: Path, figures: FigureKind | None) -> None:
-    write_document(document, folder)
-    if figures is not None and not document.status:
-        write_figures(folder / "figures", document.figures, figures)
+    with claim(folder) as place:
+        write_document(document, folder)
+        if figures is not None and not document.status:
+            place.add(f"figures/{name}.{figures}" for name in document.figures)
+            write_figures(folder / "figures", document.figures, figures)
 
 
 class _Stage(NamedTuple):

@@ -29,7 +29,7 @@ def read_npz(path: Path, num_actions: int | None, action_names: Names | None, ki
                 raise ValueError(f"{path}: {key}: an empty text; a name for every plan is expected")
             arrays[f"{key}_names"], arrays[key] = np.unique(names_of_plans, return_inverse=True)
     for key in numbered:
-        if key in arrays and arrays[key].dtype.kind not in "iuf":
+        if key in arrays and arrays[key].dtype.kind not in "biuf":
             what = "numbers, or of texts without names," if f"{key}_names" in texts else "numbers"
             raise ValueError(f"{path}: {key}: an array of {what} is expected, not of {arrays[key].dtype}")
     if "actions" not in arrays:
