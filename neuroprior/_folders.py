@@ -34,14 +34,15 @@ class Claim:
 
     def __init__(self, folder: Path, replaces: bool, owns_all: bool, command: str) -> None:
         self.folder, self._replaces, self._owns_all, self._command = folder, replaces, owns_all, command
-        self._times = 1
 
     def check(self, names: Iterable[str]) -> None:
         """Raise ValueError if a file of one of these names is there, and no earlier run wrote it as a result.
 
         Results of another command are those of somebody who may want to keep them.
         """
-        known, command = self._known()
+        self._check(names, *self._known())
+
+    def _check(self, names: Iterable[str], known: set[str], command: str) -> None:
         if self._command and command not in ("", self._command) and any(map(self._is_there, known)):
             raise ValueError(
                 f"`out` must be a folder without results of another command, got {self.folder}: {command}."
@@ -64,8 +65,8 @@ class Claim:
         names = {*names}
         if not names or self._owns_all:
             return
-        self.check(names)
-        known, _ = self._known()
+        known, command = self._known()
+        self._check(names, known, command)
         if self._replaces:
             self._replaces = False
             for name in known:
@@ -124,11 +125,7 @@ def claim(
     """
     place, claims = os.path.realpath(folder), vars(_claims)
     if place in claims:
-        claims[place]._times += 1
-        try:
-            yield claims[place]
-        finally:
-            claims[place]._times -= 1
+        yield claims[place]
         return
     made = [one for one in (Path(place), *Path(place).parents) if not one.exists()]
     descriptor = _lock(Path(place), folder, name, seconds)
@@ -146,6 +143,22 @@ def claim(
                 one.rmdir()
 
 
+def as_folder(name: str, value: object) -> Path:
+    """Return the path of a folder.
+
+    Args:
+        name: of the argument, for the message.
+        value: its value.
+
+    Raises:
+        ValueError: it names none; an empty name would be that of the present folder.
+    """
+    if not isinstance(value, str | os.PathLike) or not os.fspath(value).strip():
+        got = repr(value) if isinstance(value, str) else type(value).__name__
+        raise ValueError(f"`{name}` must be the name of a folder, got {got}")
+    return Path(value)
+
+
 def claim_out(function: F) -> F:
     """Let a function claim the folder that its argument `out` names while it runs, unless this is None.
 
@@ -158,9 +171,8 @@ def claim_out(function: F) -> F:
         bound = signature.bind(*given, **named)
         bound.apply_defaults()
         out = bound.arguments["out"]
-        if out is not None and not os.fspath(out).strip():
-            raise ValueError(f"`out` must be the name of a folder, got {out!r}.")
-        with nullcontext() if out is None else claim(Path(out), replaces=True, command=function.__name__):
+        command = function.__name__
+        with nullcontext() if out is None else claim(as_folder("out", out), replaces=True, command=command):
             return function(*given, **named)
 
     return cast(F, claiming)

@@ -10,6 +10,7 @@ import pandas as pd
 import torch
 from jsonargparse.typing import NonNegativeInt, PositiveInt
 
+from eval.study.command import Batch
 from neuroprior._folders import claim_out
 from neuroprior._jobs import JobRun
 from neuroprior._statistics import LEVEL
@@ -96,19 +97,6 @@ DESIGNS = {
     "order 2": Design(order_2=True),
     "hidden modes": Design(modes=True),
 }
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Some studies of one design."""
-
-    design: str
-    effect: bool
-    number: int
-
-    def __str__(self) -> str:
-        name = self.design.replace(",", "").replace("%", "percent").replace(" ", "-")
-        return f"{'effect' if self.effect else 'none'}-{name}-{self.number}"
 
 
 def draw_study(design: Design, effect: bool, seed: int) -> RecordedPlans:

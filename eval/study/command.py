@@ -53,7 +53,7 @@ class Batch:
     number: int
 
     def __str__(self) -> str:
-        name = self.design.replace(",", "").replace(" ", "-")
+        name = self.design.replace(",", "").replace("%", "percent").replace(" ", "-")
         return f"{'effect' if self.effect else 'none'}-{name}-{self.number}"
 
 

@@ -16,7 +16,7 @@ from jsonargparse.typing import NonNegativeInt, PositiveInt
 from rich.console import Console
 
 from neuroprior._files import write_whole
-from neuroprior._folders import LOCK, claim
+from neuroprior._folders import LOCK, as_folder, claim
 from neuroprior.behaviour.analysis.comparison import best_chain
 from neuroprior.behaviour.analysis.modes import choose_modes
 from neuroprior.behaviour.recorded_plans import RecordedPlans
@@ -168,9 +168,8 @@ def fit(
         options: the options in YAML, to be kept in the folder.
         reading: how files are read.
     """
-    if not out.strip():
-        raise ValueError(f"`out` must be the name of a folder, got {out!r}.")
-    folder, generator = Path(resume or out), torch.Generator().manual_seed(seed)
+    new = as_folder("out", out)
+    folder, generator = Path(resume) if resume else new, torch.Generator().manual_seed(seed)
     make: Callable[..., Prior] = prior
     if effort is not None:
         # Of a class that the command line names, its arguments stand among those that are given already.

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from neuroprior._checks import memory_within
 from neuroprior._files import read_json, write_whole
-from neuroprior._folders import claim
+from neuroprior._folders import as_folder, claim
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.saved import SavedModule
 
@@ -92,7 +92,7 @@ def model_bytes(prior: SavedModule) -> bytes:
 
 def write_model(data: bytes, folder: str | os.PathLike[str]) -> Path:
     """Write what `model_bytes` returned to a folder."""
-    folder = _folder(folder)
+    folder = as_folder("folder", folder)
     with claim(folder, name="folder", seconds=SECONDS):
         if (folder / CONFIG).exists() and not (folder / MODEL).exists():
             raise ValueError(f"`folder` must be one without the {CONFIG} of something else, got {folder}.")
@@ -128,7 +128,7 @@ def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu", *, 
         >>> load(folder).order
         2
     """
-    folder = _folder(folder)
+    folder = as_folder("folder", folder)
     if not isinstance(kind, type):
         raise ValueError(f"`kind` must be a class such as Prior, got {kind!r}")
     data = (folder / MODEL).read_bytes()
@@ -264,14 +264,6 @@ def _is_sound(value: Tensor, logs: bool) -> bool:
     if not value.is_floating_point() or bool(value.isfinite().all()):
         return True
     return logs and not bool((value.isnan() | (value == inf)).any() | (value == -inf).all(-1).any())
-
-
-def _folder(folder: object) -> Path:
-    """The path of a folder; ValueError for an empty name, which would be that of the present folder."""
-    if not isinstance(folder, str | os.PathLike) or not os.fspath(folder).strip():
-        got = repr(folder) if isinstance(folder, str) else type(folder).__name__
-        raise ValueError(f"`folder` must be the name of a folder, got {got}")
-    return Path(folder)
 
 
 def _names(prior: SavedModule, attribute: str) -> set[str]:
