@@ -204,7 +204,7 @@ def test_contexts_are_matched_by_name_or_it_is_said_how_they_are_numbered(learne
     report(tmp_path / "new.csv", out=tmp_path / "report", priors=[str(folder)], sections=["scores"])
     reported = json.loads((tmp_path / "report" / "results.json").read_text())
     bits = -float(prior.log_prob(plans).sum()) / math.log(2) / int(plans.mask().sum())
-    assert reported["rows"][0]["bits_per_action"] == pytest.approx(bits, rel=1e-5)
+    assert reported["scores"][0]["bits_per_behaviour"] == pytest.approx(bits, rel=1e-5)
     notes = reported["file"]["notes"]
     assert said is None or f"{folder}: the" in notes[-1]
     assert said is None or said in notes[-1]

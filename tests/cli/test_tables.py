@@ -34,8 +34,8 @@ def test_report_fit_and_score_read_it_alike(table, capsys):
     said = " ".join(capsys.readouterr().out.split())
     assert "16 of 320 rows have no label (first in lab.csv, line 11)" in said
     results = json.loads(Path("report/results.json").read_text())
-    assert results["file"]["plans"] == 32
-    assert (results["file"]["groups"], results["file"]["conditions"]) == (8, 2)
+    assert results["file"]["sequences"] == 32
+    assert (results["file"]["subjects"], results["file"]["conditions"]) == (8, 2)
     assert results["unit"] == "subjects"
     fit = ["fit", "lab.csv", "--config", "markov", "--held_out", "0.25", "--out", "prior"]
     assert main([*fit, *COLUMNS]) == 0

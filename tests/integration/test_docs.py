@@ -78,8 +78,8 @@ def rows(folder: Path, name: str) -> list[dict[str, str]]:
 
 
 def test_the_order_that_was_put_in(report: Path) -> None:
-    scores = json.loads((report / "results.json").read_text())["rows"]
-    bits = {row["model"]: row["bits_per_action"] for row in scores}
+    scores = json.loads((report / "results.json").read_text())["scores"]
+    bits = {row["model"]: row["bits_per_behaviour"] for row in scores}
     assert min(bits, key=bits.__getitem__) == "context tree"
     assert min((name for name in bits if name.startswith("markov")), key=bits.__getitem__) == "markov-1"
 

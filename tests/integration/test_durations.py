@@ -74,9 +74,9 @@ def test_a_network_that_knows_the_last_durations(file: str, tmp_path: Path):
     scored = pd.read_csv(tmp_path / "score" / "plans.csv")
     assert scored["log_likelihood"].sum() == pytest.approx(-nats, rel=1e-5)
     assert main(["report", file, "--priors", out, "--out", str(tmp_path / "report")]) == 0
-    (row,) = json.loads((tmp_path / "report" / "results.json").read_text())["rows"]
-    assert row["bits_per_action"] == pytest.approx(expected, abs=1e-4)
-    assert row["context"] == "actions and durations"
+    (row,) = json.loads((tmp_path / "report" / "results.json").read_text())["scores"]
+    assert row["bits_per_behaviour"] == pytest.approx(expected, abs=1e-4)
+    assert row["input"] == "behaviours and durations"
     assert main(["fit", "--resume", out]) == 0
     assert PastDurations.load(tmp_path / "run") == past
 

@@ -48,7 +48,7 @@ def saved(prior: Prior, plans: Plans, folder: Path) -> str:
 
 
 def evaluate(file: Path, folders: list[str]) -> list[dict]:
-    return records(report(file, priors=folders, sections=["scores"]).tables["plans"])
+    return records(report(file, priors=folders, sections=["scores"]).tables["scores"])
 
 
 def cost(prior: Prior, plans: Plans) -> float:
@@ -74,8 +74,8 @@ def test_scores_are_those_of_the_library(suffix, tmp_path):
     folders = [saved(MarkovPrior(3, 2), learned, tmp_path / "a"), saved(UniformPrior(3), learned, tmp_path / "b")]
     rows = evaluate(tmp_path / f"new.{suffix}", folders)
     for folder, row in zip(folders, rows, strict=True):
-        assert row["bits_per_action"] == pytest.approx(cost(load(folder), new), abs=1e-6)
-        assert row["low"] < row["bits_per_action"] < row["high"] or row["bits_per_action"] == row["low"]
+        assert row["bits_per_behaviour"] == pytest.approx(cost(load(folder), new), abs=1e-6)
+        assert row["low"] < row["bits_per_behaviour"] < row["high"] or row["bits_per_behaviour"] == row["low"]
     assert rows[0]["more"] == 0
     gap = score("b", load(folders[1]), new).minus(score("a", load(folders[0]), new))
     assert (rows[1]["more"], rows[1]["more_low"], rows[1]["more_high"]) == pytest.approx(gap[:3])
@@ -86,11 +86,11 @@ def test_the_command_prints_and_writes_scores(tmp_path, capsys):
     write_plans(some_plans(40, 9), tmp_path / "new.npz")
     folders = [saved(MarkovPrior(3, 2), learned, tmp_path / "a"), saved(UniformPrior(3), learned, tmp_path / "b")]
     assert main(["plans", str(tmp_path / "new.npz"), "--priors", *folders, "--out", str(tmp_path / "out")]) == 0
-    rows = json.loads((tmp_path / "out" / "results.json").read_text())["rows"]
+    rows = json.loads((tmp_path / "out" / "results.json").read_text())["scores"]
     assert rows == evaluate(tmp_path / "new.npz", folders)
-    with open(tmp_path / "out" / "plans.csv") as table:
+    with open(tmp_path / "out" / "scores.csv") as table:
         assert [row["model"] for row in csv.DictReader(table)] == folders
-    assert f"{rows[0]['bits_per_action']:.4f}" in capsys.readouterr().out
+    assert f"{rows[0]['bits_per_behaviour']:.4f}" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("suffix", ["npz", "jsonl", "csv"])
@@ -103,7 +103,7 @@ def test_actions_are_known_by_name(suffix, tmp_path):
     names = tuple(NAMES[n] for n in order.tolist())
     write_plans(replace(new, actions=place[new.actions.long()], action_names=names), tmp_path / f"new.{suffix}")
     rows = evaluate(tmp_path / f"new.{suffix}", [folder])
-    assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), new), abs=1e-6)
+    assert rows[0]["bits_per_behaviour"] == pytest.approx(cost(load(folder), new), abs=1e-6)
 
 
 @pytest.mark.parametrize("suffix", ["npz", "jsonl", "csv"])
@@ -133,7 +133,9 @@ def test_fewer_actions_than_the_prior_knows(end, named, suffix, tmp_path):
     write_plans(new, tmp_path / f"new.{suffix}")
     rows = evaluate(tmp_path / f"new.{suffix}", [folder])
     wide = replace(new, num_actions=3)
-    assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), wide.with_end() if end else wide), abs=1e-6)
+    assert rows[0]["bits_per_behaviour"] == pytest.approx(
+        cost(load(folder), wide.with_end() if end else wide), abs=1e-6
+    )
 
 
 def test_more_actions_than_the_prior_knows_are_one_line(tmp_path, capsys):
@@ -160,12 +162,12 @@ def test_ends(suffix, named, closed, tmp_path):
     folders.append(saved(ContextTreePrior(3, 2), learned, tmp_path / "open"))
     write_plans(new.with_end() if closed else new, tmp_path / f"new.{suffix}")
     rows = evaluate(tmp_path / f"new.{suffix}", folders)
-    assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folders[0]), new.with_end()), abs=1e-6)
-    assert rows[1]["bits_per_action"] == pytest.approx(cost(load(folders[1]), new), abs=1e-6)
+    assert rows[0]["bits_per_behaviour"] == pytest.approx(cost(load(folders[0]), new.with_end()), abs=1e-6)
+    assert rows[1]["bits_per_behaviour"] == pytest.approx(cost(load(folders[1]), new), abs=1e-6)
     # per action with and without ends: nothing to subtract
     assert rows[1]["more"] is rows[1]["more_low"] is rows[1]["more_high"] is None
     again = evaluate(tmp_path / f"new.{suffix}", folders[::-1])
-    assert [row["bits_per_action"] for row in again] == [row["bits_per_action"] for row in rows[::-1]]
+    assert [row["bits_per_behaviour"] for row in again] == [row["bits_per_behaviour"] for row in rows[::-1]]
 
 
 @pytest.mark.parametrize("kind", ["plan", "step"])
@@ -180,8 +182,8 @@ def test_contexts_are_known_by_name(make, kind, tmp_path):
     (write_events if kind == "step" else write_plans)(new, tmp_path / "new.csv")
     assert read(tmp_path / "new.csv").plans().context_names == ("cold", "warm")
     rows = evaluate(tmp_path / "new.csv", [folder])
-    assert rows[0]["context"] == "actions and context"
-    assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), new), abs=1e-6)
+    assert rows[0]["input"] == "behaviours and context"
+    assert rows[0]["bits_per_behaviour"] == pytest.approx(cost(load(folder), new), abs=1e-6)
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.int32, torch.int64])
@@ -194,7 +196,7 @@ def test_contexts_of_any_integer_type(kind, dtype, tmp_path):
     write_plans(turned, tmp_path / "new.npz")
     assert read_plans(tmp_path / "new.npz").context.dtype == dtype
     rows = evaluate(tmp_path / "new.npz", [folder])
-    assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), new), abs=1e-6)
+    assert rows[0]["bits_per_behaviour"] == pytest.approx(cost(load(folder), new), abs=1e-6)
 
 
 def test_contexts_without_names_are_numbers(tmp_path):
@@ -202,7 +204,7 @@ def test_contexts_without_names_are_numbers(tmp_path):
     folder = saved(MarkovPrior(3, 1, num_contexts=3), learned, tmp_path / "prior")
     write_plans(new, tmp_path / "new.csv")
     rows = evaluate(tmp_path / "new.csv", [folder])
-    assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), new), abs=1e-6)
+    assert rows[0]["bits_per_behaviour"] == pytest.approx(cost(load(folder), new), abs=1e-6)
 
 
 def test_an_unknown_context_is_one_line(tmp_path, capsys):
@@ -219,9 +221,9 @@ def test_a_prior_without_context_needs_no_known_context(tmp_path):
     folder = saved(MarkovPrior(3, 1), learned, tmp_path / "prior")
     write_plans(new, tmp_path / "new.csv")
     rows = evaluate(tmp_path / "new.csv", [folder])
-    assert rows[0]["context"] == "actions"
+    assert rows[0]["input"] == "behaviours"
     alone = replace(new, context=None, context_names=None)
-    assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), alone), abs=1e-6)
+    assert rows[0]["bits_per_behaviour"] == pytest.approx(cost(load(folder), alone), abs=1e-6)
 
 
 def test_a_context_that_is_missing_is_one_line(tmp_path, capsys):
@@ -236,7 +238,7 @@ def test_ends_and_contexts_together(tmp_path):
     folder = saved(MarkovPrior(4, 1, num_contexts=3), learned.with_end(), tmp_path / "prior")
     write_events(new, tmp_path / "new.csv")
     rows = evaluate(tmp_path / "new.csv", [folder])
-    assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), new.with_end()), abs=1e-6)
+    assert rows[0]["bits_per_behaviour"] == pytest.approx(cost(load(folder), new.with_end()), abs=1e-6)
 
 
 def test_units_are_named(tmp_path):

@@ -52,15 +52,15 @@ def test_the_entropy_rate_is_reached(second_order):
     """The best chain takes what the source has, and at most 1 % more for learning; 4 half widths are 8 errors."""
     results, probs = second_order
     truth, own = cost_after(probs, 30, 2), bits(results)
-    best = min(results["rows"], key=lambda row: row["bits_per_action"])
-    half = best["high"] - best["bits_per_action"]
+    best = min(results["scores"], key=lambda row: row["bits_per_behaviour"])
+    half = best["high"] - best["bits_per_behaviour"]
     assert half < 0.02
-    assert truth - 2 * half < best["bits_per_action"] < 1.01 * truth + 2 * half
-    assert own["markov-2"] - best["bits_per_action"] < 0.002
+    assert truth - 2 * half < best["bits_per_behaviour"] < 1.01 * truth + 2 * half
+    assert own["markov-2"] - best["bits_per_behaviour"] < 0.002
     assert own["uniform"] == pytest.approx(math.log2(3), abs=1e-6)
     assert own["markov-1"] > own["markov-2"] + 0.01
     assert own["markov-0"] > own["markov-1"]
-    (row,) = (row for row in results["rows"] if row["model"] == "markov-1")
+    (row,) = (row for row in results["scores"] if row["model"] == "markov-1")
     assert row["more_low"] > 0
     assert results["reference"].startswith(best["model"])
     assert results["unit"] == "sequences"
@@ -110,7 +110,7 @@ def test_a_planted_difference_of_groups_is_found(tmp_path):
     plans = Plans(torch.cat(parts), 3, group=group, group_names=("<i>", "[/b]", "ü", "d"), action_names=("a", "b", "c"))
     results = report(plans, tmp_path, sections=["scores", "transitions"])
     assert results["unit"] == "subjects"
-    cells = [row for row in results["transitions"] if row["group"] != "all"]
+    cells = [row for row in results["transitions"] if row["subject"] != "all"]
     assert min(row["p_value"] for row in cells) == pytest.approx(0.001)
     (test,) = results["transition_test"]
     assert (test["groups"], test["test"]) == (4, "permutation")
@@ -119,12 +119,12 @@ def test_a_planted_difference_of_groups_is_found(tmp_path):
     for a, b in zip(plans.actions[:, :-1].flatten().tolist(), plans.actions[:, 1:].flatten().tolist(), strict=True):
         counts[a, b] += 1
     for row in results["transitions"]:
-        if row["group"] == "all":
+        if row["subject"] == "all":
             a, b = ("abc".index(row[end]) for end in ("from", "to"))
             assert row["count"] == counts[a, b]
             assert row["probability"] == pytest.approx(float(counts[a, b] / counts[a].sum()))
     alike = report(replace(plans, group=torch.arange(80) % 4), tmp_path, sections=["scores", "transitions"])
-    assert min(row["p_value"] for row in alike["transitions"] if row["group"] != "all") > 0.001
+    assert min(row["p_value"] for row in alike["transitions"] if row["subject"] != "all") > 0.001
 
 
 def test_a_test_file_by_name(tmp_path):
@@ -170,7 +170,7 @@ def test_test_files_of_another_kind(learned, test, words, tmp_path, capsys):
 
 
 INTERRUPTED = ("--models", "counts", "--max-steps", "3", "--folds", "6")
-WRITTEN = ("results.json", "plans.csv", "lags.csv", "drift.csv")
+WRITTEN = ("results.json", "scores.csv", "lags.csv", "drift.csv")
 
 
 @pytest.fixture(scope="module")

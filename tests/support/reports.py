@@ -30,17 +30,17 @@ def report(plans: Plans, folder: Path, fits: FitOptions = QUICK_IN_TWO, **option
     """What `results.json` of a report on a file of plans would hold; every report must have the same shape."""
     write_plans(plans, folder / "new.npz")
     results = json.loads(json.dumps(results_of(report_on(folder / "new.npz", fits=fits, **options))))
-    for row in results["rows"]:
-        assert row["nats_per_action"] == pytest.approx(row["bits_per_action"] * math.log(2))
-        assert row["perplexity"] == pytest.approx(2 ** row["bits_per_action"])
-        assert row["low"] <= row["bits_per_action"] <= row["high"]
-        assert row["context"] in ("actions", "actions and context")
-    assert min(row["more"] for row in results["rows"]) == 0
+    for row in results["scores"]:
+        assert row["nats_per_behaviour"] == pytest.approx(row["bits_per_behaviour"] * math.log(2))
+        assert row["perplexity"] == pytest.approx(2 ** row["bits_per_behaviour"])
+        assert row["low"] <= row["bits_per_behaviour"] <= row["high"]
+        assert row["input"] in ("behaviours", "behaviours and context")
+    assert min(row["more"] for row in results["scores"]) == 0
     return results
 
 
-def bits(results: dict[str, Any], inputs: str = "actions") -> dict[str, float]:
-    return {row["model"]: row["bits_per_action"] for row in results["rows"] if row["context"] == inputs}
+def bits(results: dict[str, Any], inputs: str = "behaviours") -> dict[str, float]:
+    return {row["model"]: row["bits_per_behaviour"] for row in results["scores"] if row["input"] == inputs}
 
 
 def fails(arguments: list[str], capsys: Any, *words: str) -> None:

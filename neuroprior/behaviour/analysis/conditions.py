@@ -27,7 +27,12 @@ from neuroprior.behaviour.recordings import Recordings
 from neuroprior.plans.columns import listed
 from neuroprior.plans.plans import check_are_plans
 
-FAMILIES = {"transitions": "{}", "durations": "duration of {}", "actions": "share of {}", "sequences": "{}"}
+FAMILIES = {
+    "transitions": "{}",
+    "durations": "duration of {}",
+    "behaviours": "share of {} (by count)",
+    "sequences": "{}",
+}
 """How features of each family are called; families in the order in which they are listed.
 
 Where a transition changes, so do the shares of its actions, and of the sequences that hold it: these come last.
@@ -39,7 +44,7 @@ FEWEST_PERMUTATIONS = 999
 ENOUGH_COUNTS = 100
 """A feature is tested if it occurred so often, or once for each block on average."""
 
-MOST_FEATURES = {"actions": 1000, "transitions": 1000, "sequences": 100, "durations": 1000}
+MOST_FEATURES = {"behaviours": 1000, "transitions": 1000, "sequences": 100, "durations": 1000}
 """Of each family the commonest are tested, so many at most."""
 
 LEAST_VARIANCE = 1e-6
@@ -54,9 +59,9 @@ class ConditionFamily:
     """F features of behaviour of one kind, each with a number for each of B blocks, compared between C conditions.
 
     Attributes:
-        name: "actions": the share of each action; "transitions": the probability of the second action after the first;
-            "sequences": the share of each sequence of three actions among all; "durations": the mean natural logarithm
-            of how long each action took.
+        name: "behaviours": the share of each action; "transitions": the probability of the second action after the
+            first; "sequences": the share of each sequence of three actions among all; "durations": the mean natural
+            logarithm of how long each action took.
         features: int64 `[F, n]`: the actions of each.
         values: float64 `[B, F]`: the number of each block; NaN where there is nothing to take it from.
         means: float64 `[C, F]`: the mean over the units of each condition, with `low` and `high`, its 95 % interval.
@@ -156,7 +161,8 @@ class ConditionComparison:
 
         The columns are `family`, `parts` (a feature's actions), `feature` (its name), `mean, low, high` of each
         condition (such as `mean, drug`), of two conditions `difference` with `low` and `high`, `p_value`, `corrected`
-        for the family, `significant` and `statistic`. Durations are geometric means and ratios.
+        (for the features of the family, and for the families), `significant` and `statistic`. Durations are geometric
+        means and ratios.
         """
         if not self.families:
             return pd.DataFrame(columns=["family", "parts", "feature", "p_value", "corrected", "significant"])
@@ -177,7 +183,7 @@ class ConditionComparison:
         if len(self.condition_names) == 2:
             for what, numbers in zip(("difference", "low", "high"), family.difference, strict=True):
                 rows[what] = scaled(numbers.numpy())
-        rows["p_value"], rows["corrected"] = family.p_values.numpy(), family.corrected.numpy()
+        rows["p_value"], rows["corrected"] = family.p_values.numpy(), self.corrected(family).numpy()
         rows["significant"], rows["statistic"] = self.significant(family).numpy(), family.statistic.numpy()
         return rows
 
@@ -185,9 +191,13 @@ class ConditionComparison:
         """Whether the test of this name is significant, corrected; never where there are too few units."""
         return self.conclusive and name in self.tests and self.tests[name][1] < LEVEL
 
+    def corrected(self, family: ConditionFamily) -> Tensor:
+        """`[F]`, float64: the p-value of each feature, corrected for its family, or that of the family if larger."""
+        return family.corrected.clamp(min=self.tests[family.name][1] if family.name in self.tests else 1.0)
+
     def significant(self, family: ConditionFamily) -> Tensor:
         """`[F]` bool: the features that differ, in a family that does."""
-        return (family.corrected < LEVEL) & self.differs(family.name)
+        return (self.corrected(family) < LEVEL) & self.conclusive
 
 
 def feature_names(family: str, features: Iterable[Sequence[str]]) -> list[str]:
@@ -350,7 +360,7 @@ def _counted(
 ) -> Iterator[tuple[str, Tensor, Tensor, Tensor]]:
     """Name, features `[F, n]`, and the two sums `[B, F]` whose ratio is the number of a block, of each family."""
     ones = torch.ones(len(block), dtype=torch.double)
-    for name, length in (("actions", 1), ("transitions", 2), ("sequences", 3)):
+    for name, length in (("behaviours", 1), ("transitions", 2), ("sequences", 3)):
         at = flat.starts(length)
         features, _, counts = _sums(flat, at, length, block, num, name, ones)
         if not len(features):

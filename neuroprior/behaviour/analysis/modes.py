@@ -292,7 +292,7 @@ def mode_table(prior: SwitchingPrior, plans: Plans) -> Any:
 
     `mode`; `share` of the actions, by the smoothed posterior; `dwell`, the expected actions in it, with a next one, for
     each expected end of it (infinite where none is expected); `visits`, expected in a plan;
-    `actions`, up to three that it takes more often than all modes together, by the difference (of a single mode, the
+    `behaviours`, up to three that it takes more often than all modes together, by the difference (of a single mode, the
     most frequent), with their shares in the mode; `enters` and `leaves`, the three contexts in which the path most
     often changes to it and from it, where contexts are indices.
 
@@ -339,7 +339,7 @@ def mode_table(prior: SwitchingPrior, plans: Plans) -> Any:
             "share": float(weights[:, k].mean()),
             "dwell": float(moves[k].sum() / leaves[k]) if leaves[k] > MIN_ENDS else inf,
             "visits": float((begun[k] + enters[k]) / len(plans)),
-            "actions": ", ".join(f"{names[a]} {own[a]:.2f}" for a in most if own[a] > overall[a]),
+            "behaviours": ", ".join(f"{names[a]} {own[a]:.2f}" for a in most if own[a] > overall[a]),
         }
         if places is not None and context is not None:
             for what, of in (("enters", path[:, 1:]), ("leaves", path[:, :-1])):

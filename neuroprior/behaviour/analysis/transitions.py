@@ -61,6 +61,7 @@ class Transitions:
             plans within a group, else over groups (subjects); NaN where there is one only.
         action_names: A names.
         group_names: G names.
+        by: what groups are.
     """
 
     counts: Tensor
@@ -75,6 +76,7 @@ class Transitions:
     high: Tensor
     action_names: Sequence[str]
     group_names: Sequence[str]
+    by: Literal["subject", "condition"] = "subject"
 
     def __repr__(self) -> str:
         """Return how many transitions there are of how many kinds, and the p-value."""
@@ -85,14 +87,15 @@ class Transitions:
     def frame(self) -> pd.DataFrame:
         """Return a row for each transition that occurs, of all and of each group.
 
-        Columns: `group` ("all" for all), `from`, `to`, `count`, `probability`, `low`, `high`, `p_value` (corrected).
+        Columns: `subject` or `condition` ("all" for all), `from`, `to`, `count`, `probability`, `low`, `high`,
+        `p_value` (corrected).
         """
         counts = torch.cat([self.counts[None], self.group_counts])
         which, a, b = counts.nonzero(as_tuple=True)
         probs = torch.cat([self.probs()[None], self.group_probs()])
         p_values = torch.cat([torch.full_like(self.cell_p_values[:1], float("nan")), self.cell_p_values])
         names, groups = np.array(self.action_names, dtype=object), np.array(["all", *self.group_names], dtype=object)
-        columns = {"group": groups[which.cpu()], "from": names[a.cpu()], "to": names[b.cpu()]}
+        columns = {self.by: groups[which.cpu()], "from": names[a.cpu()], "to": names[b.cpu()]}
         numbers = (counts, probs, self.low, self.high, p_values)
         named = zip(("count", "probability", "low", "high", "p_value"), numbers, strict=True)
         return pd.DataFrame(columns | {name: values[which, a, b].cpu().numpy() for name, values in named})
@@ -211,6 +214,7 @@ def transitions(
         high,
         action_names(plans),
         numbered_names(names, groups, "group" if by is None else "condition"),
+        "subject" if by is None else "condition",
     )
 
 

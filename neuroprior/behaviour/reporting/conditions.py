@@ -26,7 +26,7 @@ from neuroprior.plans.columns import listed
 DRAWN = 8  # features in the figure
 
 TESTS = {
-    "actions": "shares of behaviours",
+    "behaviours": "shares of behaviours",
     "transitions": "transition probabilities",
     "sequences": "shares of sequences of three",
     "durations": "durations of behaviours",
@@ -74,7 +74,7 @@ def condition_section(found: Evaluation) -> Part | None:
 SENTENCES = {
     "transitions": "After {0}, {1} follows in {means}",
     "durations": "A bout of {0} lasts {means} (geometric means)",
-    "actions": "Of all behaviours {0} is {means}",
+    "behaviours": "Of all behaviours, by count, {0} is {means}",
     "sequences": "Of all sequences of three {all} is {means}",
 }
 """How the features of each family are said; `means` are those under each condition."""
@@ -88,7 +88,7 @@ def _feature_findings(result: ConditionComparison, features: pd.DataFrame, unit:
         scale, suffix = (1, f" {unit}".rstrip()) if of_time else (100, " %")
         ordered = [*reversed(result.condition_names)] if two else result.condition_names  # the reference comes last
         means = listed([f"{scale * row[f'mean, {name}']:.3g}{suffix} under {name}" for name in ordered])
-        p_corrected = max(row["corrected"], result.tests[family][1])
+        p_corrected = row["corrected"]
         sentence = SENTENCES[family].format(*parts, all=" ".join(parts), means=means)
         effect = low = high = None
         if two:
@@ -112,7 +112,7 @@ def _pair_findings(pairs: pd.DataFrame) -> list[Finding]:
         pair = f"{row['second']} against {row['first']}"
         of_time = row["family"] == "durations"
         by = f"{row['difference']:.3g} times" if of_time else f"difference {row['difference']:+.3g}"
-        p_corrected = max(row["corrected"], row["family_p"], row["all_p"])
+        p_corrected = row["corrected"]
         sentence = (
             f"{pair[0].upper()}{pair[1:]}, {row['feature']}: {by}, 95 % interval {row['low']:.3g} to {row['high']:.3g};"
             f" {p_words(p_corrected)}."
@@ -135,7 +135,7 @@ def _interaction_findings(result: ConditionInteraction, frame: pd.DataFrame) -> 
                 for name in result.stratum_names
             ]
         )
-        p_corrected = max(row["corrected"], result.tests[row["family"]][1])
+        p_corrected = row["corrected"]
         name = f"{row['feature']}, by stratum"
         sentence = f"The difference in {row['feature']} depends on the stratum ({differences}; {p_words(p_corrected)})."
         family, p = f"{row['family']}, by stratum", float(row["p_value"])
@@ -180,9 +180,9 @@ def _text(result: ConditionComparison) -> list[str]:
         f" they are. {'All' if result.exact else 'Random'} labellings that were compared, with the observed one:"
         f" {' '.join([f'{result.labellings:,}.', *design.notes])}",
         "Families of features are tested by their most different feature (Westfall and Young); the tests are corrected"
-        " for their number (step-down minP). Behaviour differs where one of them is significant. A star marks a feature"
-        " that is significant, corrected for its family, in a family that is. Rates of rare features are smoothed"
-        " towards those of all.",
+        " for their number (step-down minP). Behaviour differs where one of them is significant. The p-value of a"
+        " feature is corrected for the features of its family, and no smaller than that of the family. Rates of rare"
+        " features are smoothed towards those of all.",
     ]
 
 
@@ -236,7 +236,7 @@ def _feature_table(result: ConditionComparison, features: pd.DataFrame) -> Table
     caption = (
         f"{len(shown)} of {len(features):,} features: *: significant; then those that differ most. Transitions are"
         f" probabilities, sequences shares of all; means over {result.design.item}. Durations are geometric means and"
-        " ratios. p: corrected for the family; intervals are not."
+        " ratios. p: corrected for the features of a family and for the families; intervals are not."
     )
     return table(shown, columns, caption, "What differs")
 
@@ -247,10 +247,9 @@ def _pairs(result: ConditionComparison) -> pd.DataFrame:
     for pair in result.contrasts:
         first, second = pair.condition_names
         part = pair.frame().rename(columns={f"mean, {first}": "mean_first", f"mean, {second}": "mean_second"})
-        tested = part["family"].map({name: corrected for name, (_, corrected) in pair.tests.items()})
-        parts.append(part.assign(first=first, second=second, family_p=tested, all_p=pair.p_value))
+        parts.append(part.assign(first=first, second=second))
     columns = ["first", "second", "family", "feature", "mean_first", "mean_second", "difference", "low", "high"]
-    return pd.concat(parts)[[*columns, "p_value", "corrected", "family_p", "all_p", "significant"]]
+    return pd.concat(parts)[[*columns, "p_value", "corrected", "significant"]]
 
 
 def _pair_table(result: ConditionComparison, pairs: pd.DataFrame) -> Table:
@@ -260,15 +259,13 @@ def _pair_table(result: ConditionComparison, pairs: pd.DataFrame) -> Table:
         "feature": "feature",
         "difference": lambda row: f"{row.difference:{_sign(row)}.3g}" + " times" * (not _sign(row)),
         "95 % interval": lambda row: f"{row.low:{_sign(row)}.3g} to {row.high:{_sign(row)}.3g}",
-        "p, family": lambda row: p_text(row.family_p),
         "p": lambda row: p_text(row.corrected) + "*" * row.significant,
     }
     number = max(LISTED // len(result.contrasts), 1)
     shown = pairs.groupby(["first", "second"], sort=False).head(number)
     caption = (
-        f"The {number} features of each two conditions that differ most. p, family: of its family, corrected for the"
-        " pairs and for the test of all conditions. p: corrected for the family. *: both, and that of all families, are"
-        " below 0.05."
+        f"The {number} features of each two conditions that differ most. p: corrected for the features of a family, the"
+        " pairs, and the test of all conditions. *: p < 0.05."
     )
     return table(shown, columns, caption, "Each two conditions")
 
@@ -282,9 +279,9 @@ def _interaction(found: ConditionInteraction, actions: list[str]) -> pd.DataFram
         differences = family.differences.exp() if family.name == "durations" else family.differences
         for name, own in zip(found.stratum_names, differences, strict=True):
             part[f"difference, {name}"] = own.numpy()
-        part["p_value"], part["corrected"] = family.p_values.numpy(), family.corrected.numpy()
-        differs = found.tests[family.name][1] < LEVEL
-        parts.append(part.assign(significant=(part["corrected"] < LEVEL) & differs))
+        part["p_value"] = family.p_values.numpy()
+        part["corrected"] = family.corrected.clamp(min=found.tests[family.name][1]).numpy()
+        parts.append(part.assign(significant=part["corrected"] < LEVEL))
     return pd.concat(parts, ignore_index=True).sort_values(["corrected", "p_value"], kind="stable", ignore_index=True)
 
 
@@ -293,7 +290,8 @@ def _interaction_table(found: ConditionInteraction, frame: pd.DataFrame) -> Tabl
     for name in found.stratum_names:
         columns[f"difference,\n{name}"] = _cell_of(f"difference, {name}", ".3g")
     columns["p"] = lambda row: p_text(row.corrected) + "*" * row.significant
-    caption = f"{found.verdict} Durations are ratios. p: corrected for the family; *: significant."
+    caption = f"{found.verdict} Durations are ratios. p: corrected for the features of a family and for the families."
+    caption += " *: p < 0.05."
     return table(frame[:LISTED], columns, caption, "Do differences depend on the stratum?")
 
 

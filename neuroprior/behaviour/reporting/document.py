@@ -86,13 +86,12 @@ class Document:
         return {box.name: box.figure for section in self.sections for box in section.figures}
 
 
-def publish(document: Document, folder: Path, console: Console | None = None) -> None:
+def publish(document: Document, folder: Path) -> None:
     """Print a document's tables and lead, and write its files; see `write_document`.
 
     Args:
         document: the document.
         folder: where to write; made if it is not there.
-        console: where to print; None: standard output.
 
     Raises:
         ValueError: see `write_document`.
@@ -103,7 +102,7 @@ def publish(document: Document, folder: Path, console: Console | None = None) ->
         Order 1 is best.
         report: runs/chains/report.html
     """
-    console = console or Console(markup=False)
+    console = Console(markup=False)
     show(document, console)
     write_document(document, folder)
     console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)

@@ -56,7 +56,7 @@ def duration_section(found: Evaluation) -> Part | None:
     bounds = f"±: 95 % intervals over {over}."
     of_all = f" The {LISTED} commonest of {len(frame)}." if len(frame) > LISTED else ""
     columns: dict[str, Column] = {
-        "behaviour": "action",
+        "behaviour": "behaviour",
         "known": "known:,",
         "unkn.": "unknown:,",
         "25 %": "quartile_1:.3g",
@@ -154,8 +154,8 @@ def _by_action(plans: RecordedPlans, known: Tensor, model: DurationModel, gains:
     """A row an action, the commonest first: its durations, their law, and what this gains over an exponential one."""
     names, taken = action_names(plans), plans.mask()
     laws = model.table()
-    times = pd.DataFrame({"action": plans.actions[known].tolist(), "time": durations_of(plans)[known].tolist()})
-    groups = times.groupby("action")["time"]
+    times = pd.DataFrame({"behaviour": plans.actions[known].tolist(), "time": durations_of(plans)[known].tolist()})
+    groups = times.groupby("behaviour")["time"]
     summary = groups.describe(percentiles=[0.25, 0.5, 0.75]).reindex(range(plans.num_actions))
     number = plans.actions[taken].long().bincount(minlength=plans.num_actions)
     rows = []
@@ -164,7 +164,7 @@ def _by_action(plans: RecordedPlans, known: Tensor, model: DurationModel, gains:
             continue
         own, law = summary.loc[action], laws[action]
         count = 0 if np.isnan(own["count"]) else int(own["count"])
-        row = {"action": names[action], "known": count, "unknown": int(number[action]) - count, "zero": law.zero}
+        row = {"behaviour": names[action], "known": count, "unknown": int(number[action]) - count, "zero": law.zero}
         row |= {"quartile_1": own["25%"], "median": own["50%"], "quartile_3": own["75%"], "mean": own["mean"]}
         row |= {"law": law.law if law.number else "of all"}
         row |= {"parameters": ", ".join(f"{name} {value:.4g}" for name, value in law.parameters.items())}
@@ -267,10 +267,10 @@ def dwell_times(plans: RecordedPlans, model: DurationModel) -> pd.DataFrame:
         fitted = model.cdf(action, edges).diff() / max(1 - zero, 1e-12)
         law = laws[action].law if laws[action].number else f"{laws[action].law}, of all"
         columns = {"low": edges[:-1], "high": edges[1:], "density": share / width, "fitted": fitted / width}
-        row = {"action": names[action], "number": len(own), "zero": zero, "law": law}
+        row = {"behaviour": names[action], "number": len(own), "zero": zero, "law": law}
         rows.append(pd.DataFrame({what: column.numpy() for what, column in columns.items()}).assign(**row))
     frame = pd.concat(rows, ignore_index=True)
-    return frame[["action", "number", "zero", "law", "low", "high", "density", "fitted"]]
+    return frame[["behaviour", "number", "zero", "law", "low", "high", "density", "fitted"]]
 
 
 def _bins(times: Any, step: float) -> Any:

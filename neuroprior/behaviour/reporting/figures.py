@@ -59,7 +59,11 @@ MOST_NAMES = 60  # actions up to which each has its name beside the matrix; of m
 
 OTHER = "#7d838c"
 
-INPUT_STYLES = {"actions": ("o", True), "actions and context": ("o", False), "actions and durations": ("D", False)}
+INPUT_STYLES = {
+    "behaviours": ("o", True),
+    "behaviours and context": ("o", False),
+    "behaviours and durations": ("D", False),
+}
 """How a dot of a model with an input is drawn: its marker, and whether it is hollow."""
 
 DEEPEST = 0.8
@@ -70,8 +74,8 @@ GAMMA = 0.7
 
 
 def model_names(frame: pd.DataFrame) -> pd.Series:
-    """The names of models with their input, from the columns `model` and `context`."""
-    given = frame["context"].str.extract("(context|durations)")[0]
+    """The names of models with their input, from the columns `model` and `input`."""
+    given = frame["input"].str.extract("(context|durations)")[0]
     return frame["model"] + (", with " + given).fillna("")
 
 
@@ -88,24 +92,24 @@ def score_figure(scores: pd.DataFrame) -> Figure:
     arrow at the edge, so that the others can be compared; all values stand at the right.
 
     Args:
-        scores: the table `plans` of a report: `model`, `context` (its input: "actions", "actions and context"
-            or "actions and durations"), `bits_per_action`, `low`, `high`; a model may have a row for each input.
+        scores: the table `scores` of a report: `model`, `input` ("behaviours", "behaviours and context" or
+            "behaviours and durations"), `bits_per_behaviour`, `low`, `high`; a model may have a row for each input.
     """
     expect_some("scores", scores)
-    best = scores.assign(bits=floats(scores["bits_per_action"])).groupby("model", sort=False)["bits"].min()
+    best = scores.assign(bits=floats(scores["bits_per_behaviour"])).groupby("model", sort=False)["bits"].min()
     models = best.fillna(np.inf).sort_values(ascending=False, kind="stable").index
     figure, (axes,) = panels(1, 1, (WIDTH, 0.9 + 0.36 * max(len(models), 2)))
-    styles = {inputs: INPUT_STYLES[inputs] for inputs in INPUT_STYLES if inputs in set(scores["context"])}
+    styles = {inputs: INPUT_STYLES[inputs] for inputs in INPUT_STYLES if inputs in set(scores["input"])}
     many = len(styles) > 1
     limit = _edge(best.dropna().to_numpy())
     color = dict(zip(best.index, colors(list(best.index)), strict=True))
     for y, model in enumerate(models):
-        own = scores[scores["model"] == model].sort_values("context", key=lambda names: names.map([*styles].index))
+        own = scores[scores["model"] == model].sort_values("input", key=lambda names: names.map([*styles].index))
         reach = (0, 0.17, 0.26)[len(own) - 1]
         for row, place in zip(own.itertuples(), np.linspace(reach, -reach, len(own)), strict=True):
-            estimate, (shape, hollow) = (row.bits_per_action, row.low, row.high), styles[row.context]
+            estimate, (shape, hollow) = (row.bits_per_behaviour, row.low, row.high), styles[row.input]
             dot(axes, y + place, estimate, color[model], many and hollow, (-np.inf, limit), shape)
-        values = ", ".join("" if np.isnan(bits) else f"{bits:.3f}" for bits in floats(own["bits_per_action"]))
+        values = ", ".join("" if np.isnan(bits) else f"{bits:.3f}" for bits in floats(own["bits_per_behaviour"]))
         axes.text(1.03, y, values, transform=axes.get_yaxis_transform(), va="center")
     names_down(axes, [short(model, 36) for model in models])
     axes.set_xlabel("bits per behaviour (less is better)")
@@ -163,7 +167,7 @@ def dwell_figure(dwell: pd.DataFrame) -> Figure:
             unit of the natural logarithm.
     """
     expect_some("dwell", dwell)
-    actions = list(dict(iter(dwell.groupby("action", sort=False))).items())
+    actions = list(dict(iter(dwell.groupby("behaviour", sort=False))).items())
     shown = sorted(actions, key=lambda item: -int(item[1]["number"].iloc[0]))[:MOST_PANELS]
     across = min(len(shown), 3)
     down = -(-len(shown) // across)
@@ -511,11 +515,11 @@ def drift_figure(drift: pd.DataFrame, plans: pd.DataFrame) -> Figure:
 
     Args:
         drift: the table of a report: `what`, `name`, `bits`, `low`, `high`. Where `what` is "place", the equal parts of
-            the plans from the first to the last; where it is "group", the groups, of which at most `MOST_GROUPS` are
+            the plans from the first to the last; where it is "subject", the groups, of which at most `MOST_GROUPS` are
             drawn, the one that takes the most bits at the top.
         plans: `index` of a plan in its group, `bits` per action; at most `MOST_PLANS` are drawn.
     """
-    parts, groups = (drift[drift["what"] == what] for what in ("place", "group"))
+    parts, groups = (drift[drift["what"] == what] for what in ("place", "subject"))
     ranked = groups[groups["bits"].notna()].sort_values("bits", kind="stable")
     ranked = ranked.iloc[_evenly(len(ranked), MOST_GROUPS)]
     low = 0.9 + 0.24 * max(len(ranked), 2)

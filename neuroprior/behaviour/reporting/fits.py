@@ -25,7 +25,7 @@ from neuroprior.priors.learning import plans_for, split_validation
 
 Arrays = dict[str, np.ndarray[Any, Any]]
 
-ACTIONS, CONTEXT, DURATIONS = "actions", "actions and context", "actions and durations"
+ACTIONS, CONTEXT, DURATIONS = "behaviours", "behaviours and context", "behaviours and durations"
 """The input of a model; durations are those of past actions."""
 
 WITH = {ACTIONS: "", CONTEXT: ", with context", DURATIONS: ", with durations"}

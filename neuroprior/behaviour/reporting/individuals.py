@@ -64,7 +64,7 @@ def individual_section(found: Evaluation) -> Part | None:
         " By chance: 95 % stay below where all are alike (chains of order 1, with as many transitions)."
     )
     tables = [table(frame, columns, caption, "Individuals", "lrrrl")]
-    frames = {"individuals": frame, "individual_budget": budget.reset_index()}
+    frames = {"individuals": frame, "individual_budget": budget.reset_index(names="individual")}
     text = []
     if len(result.names) >= FEWEST_INDIVIDUALS:
         types = individual_types(plans, generator)

@@ -71,7 +71,7 @@ def mode_section(found: Evaluation) -> Part | None:
         "%": lambda row: f"{100 * row['share']:.1f}",
         "dwell": "dwell:.1f",
         "visits": "visits:.1f",
-        "actions": "actions",
+        "behaviours": "behaviours",
     }
     columns |= {side: side for side in ("enters", "leaves") if side in described}
     caption = (

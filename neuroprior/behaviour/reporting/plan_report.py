@@ -62,9 +62,6 @@ from neuroprior.priors.scoring import are_among, learned_from, plan_digests
 MOST_ACTIONS = 10_000
 """Kinds of actions beyond which they are thought to be names that look like numbers."""
 
-KEYS = {"plans": "rows"}
-"""The keys of tables in `results.json`, where they are others than the names of the CSV files."""
-
 SECONDS_A_STATUS = 60
 """How often the page says anew how long networks take."""
 
@@ -105,7 +102,7 @@ def report(
         each: is called with what needs no network as soon as this is written, and again as more is there.
 
     Returns:
-        All that is printed and written; its `tables`, of which that of models is "plans", and its `figures`, such as
+        All that is printed and written; its `tables`, of which that of models is "scores", and its `figures`, such as
         "scores", "lags" and "transitions".
 
     Raises:
@@ -340,7 +337,6 @@ def _document(
             "file": {"name": file, **describe(found.plans)},
             "findings": [finding.row() for finding in findings],
         },
-        keys=KEYS,
         graphs={name: graph for part in parts for name, graph in part.graphs.items()},
         headline=headline([*verdicts, *_scored(found)], [part.findings for part in parts]),
     )

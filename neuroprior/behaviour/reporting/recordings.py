@@ -46,8 +46,8 @@ def recording_section(found: Evaluation) -> Part | None:
         "95 % interval": lambda row: "" if np.isnan(row.low) else f"{100 * row.low:.1f} to {100 * row.high:.1f}",
         "subjects": "subjects",
     }
-    if budget["level"].ne("").any():
-        percent = {str(recordings.factors[0]): "level", **percent}
+    if budget["condition"].ne("").any():
+        percent = {str(recordings.factors[0]): "condition", **percent}
     unknown = int(recordings.events["stop"].isna().sum())
     caption = "Share of the watched time, mean over subjects." + (
         f" Of {unknown:,} events the end is not known: they take no time here." if unknown else ""
@@ -77,14 +77,14 @@ def recording_section(found: Evaluation) -> Part | None:
 
 
 def subject_budget(recordings: Recordings) -> pd.DataFrame:
-    """Return the share of the watched time of each behaviour and subject: `level, subject, behaviour, share`."""
+    """Return the share of the watched time of each behaviour and subject: `condition, subject, behaviour, share`."""
     kept = recordings.of_one_observer()
     parts = []
     for level, part in kept.by_level(_shown_factor(kept)):
         shares = part.time_budget().rename_axis(index="subject", columns="behaviour")
-        parts.append(shares.reset_index().melt("subject", value_name="share").assign(level=level))
+        parts.append(shares.reset_index().melt("subject", value_name="share").assign(condition=level))
     whole = pd.concat(parts, ignore_index=True).dropna()
-    return whole.reindex(columns=["level", "subject", "behaviour", "share"])
+    return whole.reindex(columns=["condition", "subject", "behaviour", "share"])
 
 
 def time_course(recordings: Recordings, bins: int = BINS) -> pd.DataFrame:
@@ -95,12 +95,12 @@ def time_course(recordings: Recordings, bins: int = BINS) -> pd.DataFrame:
         bins: equal parts of the longest recording.
 
     Returns:
-        A frame with the columns `level` (of the only factor), `behaviour, time` (the middle of a part), `share` of the
-        watched time there, mean over subjects, its 95 % interval `low, high`, and `subjects`. Empty where no recording
-        takes any time.
+        A frame with the columns `condition` (of the only factor), `behaviour, time` (the middle of a part), `share` of
+        the watched time there, mean over subjects, its 95 % interval `low, high`, and `subjects`. Empty where no
+        recording takes any time.
     """
     kept = recordings.of_one_observer()
-    columns = ["level", "behaviour", "time", "share", "low", "high", "subjects"]
+    columns = ["condition", "behaviour", "time", "share", "low", "high", "subjects"]
     begin = kept.watched.groupby(KEYS)["start"].min().rename("begin")
     events, watched = (frame.merge(begin, on=KEYS) for frame in (kept.events, kept.watched))
     longest = float((watched["stop"] - watched["begin"]).max())
@@ -114,10 +114,10 @@ def time_course(recordings: Recordings, bins: int = BINS) -> pd.DataFrame:
         return overlap(start, stop, edges)
 
     factor = _shown_factor(kept)
-    events = events.assign(level=events[factor] if factor else "")
-    watched = watched.merge(events.groupby(KEYS)["level"].first().reset_index(), on=KEYS)
-    time = pd.DataFrame(inside(watched)).groupby([watched["level"], watched["subject"]]).sum()
-    done = pd.DataFrame(inside(events)).groupby([events["level"], events["subject"], events["behaviour"]]).sum()
+    events = events.assign(condition=events[factor] if factor else "")
+    watched = watched.merge(events.groupby(KEYS)["condition"].first().reset_index(), on=KEYS)
+    time = pd.DataFrame(inside(watched)).groupby([watched["condition"], watched["subject"]]).sum()
+    done = pd.DataFrame(inside(events)).groupby([events["condition"], events["subject"], events["behaviour"]]).sum()
     rows = []
     for level in time.index.get_level_values(0).unique():
         own, whole = done.loc[level], time.loc[level].where(lambda values: values > 0)
@@ -141,20 +141,20 @@ def budget_figure(budget: pd.DataFrame, each: pd.DataFrame) -> Figure:
     """The share of the watched time of each behaviour: a row a behaviour and level, a dot a subject, means with bars.
 
     Args:
-        budget: `level, behaviour, share, low, high`, see `time_budget`.
-        each: `level, subject, behaviour, share`, see `subject_budget`.
+        budget: `condition, behaviour, share, low, high`, see `time_budget`.
+        each: `condition, subject, behaviour, share`, see `subject_budget`.
     """
-    levels = list(budget["level"].unique())
+    levels = list(budget["condition"].unique())
     order = list(budget.groupby("behaviour")["share"].max().sort_values().index)
     figure, (axes,) = panels(1, 1, (WIDTH, 0.8 + 0.2 * (1 + len(levels)) * len(order)))
     hues = level_colors(levels)
     spread = np.linspace(0.28, -0.28, len(levels)) if len(levels) > 1 else np.zeros(1)
     for place, behaviour in enumerate(order):
         for shift, level in zip(spread, levels, strict=True):
-            of = (each["behaviour"] == behaviour) & (each["level"] == level)
+            of = (each["behaviour"] == behaviour) & (each["condition"] == level)
             dots = 100 * each.loc[of, "share"]
             axes.plot(dots, np.full(len(dots), place + shift), "o", ms=4.5, mew=0, alpha=0.5, color=hues[level])
-            own = budget[(budget["behaviour"] == behaviour) & (budget["level"] == level)]
+            own = budget[(budget["behaviour"] == behaviour) & (budget["condition"] == level)]
             for row in own.itertuples():
                 axes.hlines(place + shift, 100 * row.low, 100 * row.high, color=hues[level], lw=2.2)
                 axes.plot(100 * row.share, place + shift, "|", ms=11, mew=2.4, color=INK)
@@ -175,14 +175,14 @@ def course_figure(course: pd.DataFrame) -> Figure:
         course: of `time_course`.
     """
     shown = list(course.groupby("behaviour")["share"].mean().sort_values(ascending=False).index)[:MOST_PANELS]
-    levels = list(course["level"].unique())
+    levels = list(course["condition"].unique())
     hues = level_colors(levels)
     across = min(len(shown), 3)
     down = -(-len(shown) // across)
     figure, cells = panels(down, across, (WIDTH, 1.7 * down + 0.6), sharex=True)
     for axes, behaviour in zip(cells, shown, strict=False):
         for level in levels:
-            own = course[(course["behaviour"] == behaviour) & (course["level"] == level)]
+            own = course[(course["behaviour"] == behaviour) & (course["condition"] == level)]
             own = own[own["subjects"] >= own["subjects"].max() / 2]
             bounds = own[["share", "low", "high"]].clip(0, 1).mul(100)
             rows = np.column_stack([own["time"], bounds])
@@ -198,18 +198,18 @@ def time_budget(each: pd.DataFrame) -> pd.DataFrame:
     """Return the share of the watched time that each behaviour takes at each level, from that of each subject.
 
     Args:
-        each: `level, subject, behaviour, share`, see `subject_budget`.
+        each: `condition, subject, behaviour, share`, see `subject_budget`.
 
     Returns:
-        A frame with the columns `level` ("" without a factor), `behaviour, share, low, high, subjects`: means over
+        A frame with the columns `condition` ("" without a factor), `behaviour, share, low, high, subjects`: means over
         subjects, with Student's 95 % interval (NaN for a single subject); the longest behaviour of each level first.
     """
     rows = []
-    for level, shares in each.groupby("level", sort=False):
+    for level, shares in each.groupby("condition", sort=False):
         behaviours = shares.groupby("behaviour")["share"]
         for behaviour in behaviours.mean().sort_values(ascending=False).index:
             rows.append((level, behaviour, *_mean(behaviours.get_group(behaviour).to_numpy())))
-    return pd.DataFrame(rows, columns=["level", "behaviour", "share", "low", "high", "subjects"])
+    return pd.DataFrame(rows, columns=["condition", "behaviour", "share", "low", "high", "subjects"])
 
 
 def _mean(shares: NDArray[np.float64]) -> tuple[float, float, float, int]:

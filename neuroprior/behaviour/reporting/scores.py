@@ -109,8 +109,8 @@ class Evaluation:
         rows = []
         for model in self.models:
             bits, low, high, _ = model.score.bits_per_action()
-            row = {"model": model.name, "context": model.inputs, "bits_per_action": bits, "low": low, "high": high}
-            for end, value in (("_per_action", bits), ("_low", low), ("_high", high)):
+            row = {"model": model.name, "input": model.inputs, "bits_per_behaviour": bits, "low": low, "high": high}
+            for end, value in (("_per_behaviour", bits), ("_low", low), ("_high", high)):
                 row["nats" + end] = value * log(2)
             for end, value in (("", bits), ("_low", low), ("_high", high)):
                 row["perplexity" + end] = 2**value
@@ -174,7 +174,7 @@ def evaluate(
                 models.append(Model(name, inputs, how, bits, score_bits(name, inputs, bits, scored, mask)))
     models.sort(key=lambda model: ([*WITH].index(model.inputs), ORDERED.index(model.name)))
     best = min(models, key=lambda model: model.cost, default=None)
-    gains.sort(key=lambda row: (row["context"] == CONTEXT, row["model"] != COUNTED))
+    gains.sort(key=lambda row: (row["input"] == CONTEXT, row["model"] != COUNTED))
     table = pd.DataFrame(gains)
     reference = None if best is None else (best, f"{best.name} ({best.inputs})")
     return Evaluation(plans, scored, mask, models, reference, scored[held_out[0]], table, asdict(design), promises)
@@ -190,7 +190,7 @@ def _gains(arrays: Arrays, inputs: str) -> list[dict[str, Any]]:
         scores = [Score(name, inputs, bits, actions) for bits, actions in pairs]
         for lag in range(1, len(scores)):
             bits, low, high, _ = scores[lag - 1].minus(scores[lag])
-            row = {"what": "gain", "model": name, "context": inputs, "lag": lag, "bits": bits, "low": low, "high": high}
+            row = {"what": "gain", "model": name, "input": inputs, "lag": lag, "bits": bits, "low": low, "high": high}
             rows.append(row | {"units": len(scores[lag].actions)})
     return rows
 

@@ -21,6 +21,7 @@ from neuroprior.behaviour.reporting.conditions import condition_section
 from neuroprior.behaviour.reporting.document import Column, table
 from neuroprior.behaviour.reporting.durations import duration_section
 from neuroprior.behaviour.reporting.findings import Finding, gain_finding
+from neuroprior.behaviour.reporting.fits import ACTIONS
 from neuroprior.behaviour.reporting.individuals import individual_section
 from neuroprior.behaviour.reporting.modes import mode_section
 from neuroprior.behaviour.reporting.page import FigureBox, Section, Table
@@ -37,18 +38,18 @@ BEGINNING = 5  # actions of a plan that do not count in drift
 
 def file_section(found: Evaluation) -> Part:
     """What was read: how many plans of which kind, the commonest of their actions, and the plans over time."""
-    plans, frame = found.plans, action_frame(found.plans)
-    columns = {"sequences": "plans:,", "behaviours": "actions:,", "shortest": "shortest", "longest": "longest"}
-    columns |= {"kinds of\nbehaviour": "kinds of actions", "subjects": "groups", "context": "context"}
+    plans, frame = found.plans, behaviour_frame(found.plans)
+    columns = {"sequences": "sequences:,", "behaviours": "behaviours:,", "shortest": "shortest", "longest": "longest"}
+    columns |= {"kinds": "kinds", "subjects": "subjects", "context": "context"}
     columns |= {"conditions": "conditions"} if plans.condition is not None else {}
     notes = "".join(f"{note[:1].upper()}{note[1:]}. " for note in plans.notes).strip()
     align = "rrrrrrl" + "r" * (len(columns) - 7)
     described = table(pd.DataFrame([describe(plans)]), columns, notes, "The study", align)
     counted: dict[str, Column] = {
-        "behaviour": "action",
+        "behaviour": "behaviour",
         "count": "count:,",
         "%": lambda row: f"{100 * row.share:.1f}",
-        "sequences": "plans:,",
+        "sequences": "sequences:,",
     }
     if plans.durations is not None:
         counted |= {"median duration": "median_duration:.3g"}
@@ -61,19 +62,21 @@ def file_section(found: Evaluation) -> Part:
         caption += (" and condition" if plans.condition is not None else "") + "."
         alt = "The sequences as rows of coloured strips over time."
         boxes = [FigureBox(figures.ethogram_figure(plans), caption, alt, "ethogram")]
-    return Part(Section("The study", tables=tables, figures=boxes), {"actions": frame})
+    return Part(Section("The study", tables=tables, figures=boxes), {"behaviours": frame})
 
 
-def action_frame(plans: RecordedPlans) -> pd.DataFrame:
-    """How often each action occurs, in how many plans, and its median duration; the commonest first."""
+def behaviour_frame(plans: RecordedPlans) -> pd.DataFrame:
+    """How often each behaviour occurs, in how many sequences, and its median duration; the commonest first."""
     mask = plans.mask()
     plan = mask.nonzero()[:, 0]
-    data = {"action": plans.actions[mask].tolist(), "plan": plan.tolist()}
+    data = {"behaviour": plans.actions[mask].tolist(), "sequence": plan.tolist()}
     data["duration"] = [None] * len(plan) if plans.durations is None else plans.durations[mask].tolist()
-    found = pd.DataFrame(data).astype({"duration": "float64"}).groupby("action")
-    frame = found.agg(count=("plan", "size"), plans=("plan", "nunique"), median_duration=("duration", "median"))
+    found = pd.DataFrame(data).astype({"duration": "float64"}).groupby("behaviour")
+    frame = found.agg(
+        count=("sequence", "size"), sequences=("sequence", "nunique"), median_duration=("duration", "median")
+    )
     names = action_names(plans)
-    frame.insert(0, "action", [names[action] for action in frame.index])
+    frame.insert(0, "behaviour", [names[action] for action in frame.index])
     frame.insert(2, "share", frame["count"] / max(len(plan), 1))
     frame = frame.sort_values("count", ascending=False, kind="stable").reset_index(drop=True)
     return frame if plans.durations is not None else frame.drop(columns="median_duration")
@@ -88,12 +91,12 @@ def describe(plans: RecordedPlans) -> dict[str, Any]:
         kind = "patterns" if has_patterns(plans.context) else kind
         context = f"{kind}, {'at each step' if constant_context(plans) is None else 'once a sequence'}"
     return {
-        "plans": len(plans),
-        "actions": int(lengths.sum()),
+        "sequences": len(plans),
+        "behaviours": int(lengths.sum()),
         "shortest": int(lengths.min()),
         "longest": int(lengths.max()),
-        "kinds of actions": plans.num_actions,
-        "groups": 0 if plans.group is None else len(plans.group.unique()),
+        "kinds": plans.num_actions,
+        "subjects": 0 if plans.group is None else len(plans.group.unique()),
         "context": context,
         "conditions": 0 if plans.condition is None else len(plans.condition.unique()),
         "durations": plans.durations is not None,
@@ -111,8 +114,8 @@ def score_section(found: Evaluation) -> Part | None:
     columns: Mapping[str, Column] = {
         "model": lambda row: f"{row.model} (training data)" if row.model in learned else str(row.model),
         "input": _input,
-        "nats": "nats_per_action:.4f",
-        "bits per\nbehaviour": lambda row: f"{row.bits_per_action:.4f}±{row.high - row.bits_per_action:.4f}",
+        "nats": "nats_per_behaviour:.4f",
+        "bits per\nbehaviour": lambda row: f"{row.bits_per_behaviour:.4f}±{row.high - row.bits_per_behaviour:.4f}",
         "perpl.": "perplexity:.3f",
         "more bits": lambda row: "" if pd.isna(row.more) else f"{row.more:+.4f}±{more[row.name]:.4f}",
     }
@@ -144,7 +147,7 @@ def score_section(found: Evaluation) -> Part | None:
     box = FigureBox(figures.score_figure(scores), caption_of_figure, alt, "scores")
     title = "Scores" if saved else "Held-out scores"
     shown = table(scores, columns, caption, align="llrrrr")
-    return Part(Section(title, text, [shown], [box]), {"plans": scores})
+    return Part(Section(title, text, [shown], [box]), {"scores": scores})
 
 
 def _not_trained(found: Evaluation) -> list[str]:
@@ -259,7 +262,7 @@ def drift_section(found: Evaluation) -> Part | None:
     numbers = list(groups.groups)
     names = dict(zip(numbers, group_names(found.scored, torch.tensor(numbers)), strict=True))
     rows = [("place", f"part {n} of {len(within.parts)}", *one) for n, one in enumerate(within.parts, 1)]
-    rows += [("group", names[number], *one) for number, one in groups.groups.items()]
+    rows += [("subject", names[number], *one) for number, one in groups.groups.items()]
     drift = pd.DataFrame(rows, columns=["what", "name", "bits", "low", "high"])
     own = pd.DataFrame({"group": plans.group.tolist(), "bits": plans.bits.tolist()})
     own = own.assign(index=own.groupby("group").cumcount() + 1)
@@ -392,4 +395,4 @@ def _num_contexts(plans: Plans) -> int | None:
 
 def _input(row: Any) -> str:
     """The input of a model, short enough for a terminal."""
-    return str(row["context"]).replace(" and ", ", ")
+    return str(row["input"]).replace(f"{ACTIONS} and ", "+ ")

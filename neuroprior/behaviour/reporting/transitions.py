@@ -29,7 +29,7 @@ def transition_section(found: Evaluation) -> Part | None:
     frame = result.frame()
     frames = {"transitions": frame, "transition_test": pd.DataFrame()}
     text = ["The probability of each behaviour after each other one, within sequences."]
-    shown = frame[frame["group"] == "all"].sort_values("count", ascending=False, kind="stable")[:LISTED]
+    shown = frame[frame["subject"] == "all"].sort_values("count", ascending=False, kind="stable")[:LISTED]
     columns: dict[str, Column] = {
         "transition": lambda row: f"{row['from']} → {row['to']}",
         "count": "count:,",
@@ -63,12 +63,12 @@ def transition_section(found: Evaluation) -> Part | None:
             caption = f"Difference in probability, {second} less {first}. What is significant: see Conditions."
             boxes.append(FigureBox(drawing, caption, "Difference of transitions.", "transition_difference"))
     if len(result.groups) > 1:
-        row = {"groups": len(result.groups), "test": result.test, "permutations": result.permutations}
+        row = {"subjects": len(result.groups), "test": result.test, "permutations": result.permutations}
         test = pd.DataFrame([row | {"statistic": result.statistic, "p_value": result.p_value}])
         frames["transition_test"] = test
         text.append(without_verdict(few) or "That subjects have the same transitions is tested by permuting sequences.")
         if not few:
-            columns = {"subjects": "groups", "permutations": "permutations:,", "p": "p_value:.2g"}
+            columns = {"subjects": "subjects", "permutations": "permutations:,", "p": "p_value:.2g"}
             caption = "Whether subjects have the same transitions (p: blank if not tested)."
             tables.append(table(test, columns, caption, "Do subjects differ?", align="rrr"))
     return Part(Section("Transitions", text, tables, boxes), frames, graphs={"transition_graph": result.graph()})

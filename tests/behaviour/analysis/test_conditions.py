@@ -18,7 +18,7 @@ from neuroprior.behaviour.recorded_plans import RecordedPlans
 from tests.support.sources import refuses, seeded
 from tests.support.studies import between, study, within
 
-TESTS = ["actions", "transitions", "sequences", "durations", "bits", "classifier"]
+TESTS = ["behaviours", "transitions", "sequences", "durations", "bits", "classifier"]
 
 
 def family_of(found, name):
@@ -77,7 +77,7 @@ def test_between_units_all_labellings_are_compared_by_welchs_t():
     welch = [stats.ttest_ind(shares[own == 1], shares[own == 0], equal_var=False).statistic ** 2 for own in others]
     found = compare_conditions(plans)
     assert (found.labellings, found.exact, found.smallest_p) == (35, True, 1 / 35)
-    expect_p_values(family_of(found, "actions"), np.array(welch))
+    expect_p_values(family_of(found, "behaviours"), np.array(welch))
 
 
 def test_within_units_conditions_are_swapped_and_compared_by_the_paired_t():
@@ -90,7 +90,7 @@ def test_within_units_conditions_are_swapped_and_compared_by_the_paired_t():
         pair = np.where(np.array(swap)[:, None, None], shares[:, ::-1], shares)
         paired.append(stats.ttest_rel(pair[:, 1], pair[:, 0]).statistic ** 2)
     assert (found.labellings, found.exact, found.smallest_p) == (32, True, 2 / 32)
-    expect_p_values(family_of(found, "actions"), np.array(paired))
+    expect_p_values(family_of(found, "behaviours"), np.array(paired))
 
 
 def test_three_conditions_between_units():
@@ -105,8 +105,8 @@ def test_three_conditions_between_units():
         statistics.append((weight * (mean - common) ** 2).sum(0) / 2)
     found = compare_conditions(plans)
     assert (found.labellings, found.smallest_p) == (90, 6 / 90)
-    expect_p_values(family_of(found, "actions"), np.array(statistics))
-    assert family_of(found, "actions").difference.isnan().all()
+    expect_p_values(family_of(found, "behaviours"), np.array(statistics))
+    assert family_of(found, "behaviours").difference.isnan().all()
 
 
 def test_three_conditions_within_units_are_compared_by_the_f_of_repeated_measures():
@@ -121,7 +121,7 @@ def test_three_conditions_within_units_are_compared_by_the_f_of_repeated_measure
         statistics.append((conditions / 2) / (rest / 6))
     found = compare_conditions(plans)
     assert (found.labellings, found.smallest_p) == (6**4, 6 / 6**4)
-    expect_p_values(family_of(found, "actions"), np.array(statistics))
+    expect_p_values(family_of(found, "behaviours"), np.array(statistics))
 
 
 def refitted(plans: Plans) -> dict[tuple[int, int], list[float]]:
@@ -233,7 +233,7 @@ def test_estimates_are_weighted_means_over_animals_with_students_intervals():
     plans = RecordedPlans(
         actions, 2, torch.tensor(lengths), group=torch.arange(6), condition=torch.tensor([0, 0, 0, 1, 1, 1])
     )
-    family = family_of(compare_conditions(plans), "actions")
+    family = family_of(compare_conditions(plans), "behaviours")
     share, n = np.array(ones) / lengths, np.array(lengths)
     weight = n / (n + SMOOTHING)
     np.testing.assert_allclose(family.values[:, 1], share)
@@ -254,7 +254,7 @@ def test_estimates_are_weighted_means_over_animals_with_students_intervals():
 
 def test_paired_differences_are_weighted_over_animals():
     plans = study(7, [[0, 1], [0, 1, 1], [0, 0, 1], [0, 1]], length=15)
-    family = family_of(compare_conditions(plans), "actions")
+    family = family_of(compare_conditions(plans), "behaviours")
     label, n = np.array([0, 1] * 4), np.array([15, 15, 15, 30, 30, 15, 15, 15])
     gap = np.diff(family.values.numpy().reshape(4, 2, -1), axis=1)[:, 0]
     weight = 1 / (1 + SMOOTHING / n[label == 0] + SMOOTHING / n[label == 1])[:, None]
@@ -281,7 +281,7 @@ def test_features_are_shares_and_mean_log_durations_by_hand():
         for family in found.families
         for feature, value in zip(family.features.tolist(), family.values[0], strict=True)
     }
-    assert numbers["actions", 0] == 5 / 10
+    assert numbers["behaviours", 0] == 5 / 10
     assert numbers["transitions", 0, 1] == 3 / 4
     assert numbers["transitions", 1, 0] == 2 / 4
     assert numbers["sequences", 0, 1, 0] == 1 / 6
@@ -536,7 +536,7 @@ def test_conditions_with_the_same_mean_do_not_differ(order):
     often = [3, 7, 12, 18]
     rows = [[0] * k + [1] * (20 - k) for k in [*often, *(often[place] for place in order)]]
     plans = RecordedPlans(torch.tensor(rows), 2, group=torch.arange(8), condition=torch.arange(8) // 4)
-    assert family_of(compare_conditions(plans), "actions").p_values.tolist() == [1, 1]
+    assert family_of(compare_conditions(plans), "behaviours").p_values.tolist() == [1, 1]
 
 
 def move(probs: Tensor, condition: Tensor) -> None:
@@ -625,7 +625,7 @@ def test_the_frame_has_names_and_the_repr_is_short():
     frame = result.frame().set_index("feature")
     assert frame["significant"].tolist() == sorted(frame["significant"], reverse=True)
     share = torch.stack([(actions == 2)[condition == c].double().mean() for c in (0, 1)])
-    row = frame.loc["share of rest"]
+    row = frame.loc["share of rest (by count)"]
     assert (row["mean, vehicle"], row["mean, drug"]) == pytest.approx(tuple(share.tolist()), abs=0.02)
     assert row["difference"] == pytest.approx(float(share[1] - share[0]), abs=0.02)
     assert frame.loc["duration of eat", "difference"] == pytest.approx(2, abs=0.3)

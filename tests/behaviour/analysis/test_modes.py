@@ -153,10 +153,10 @@ def test_the_table_says_what_each_mode_does():
     assert table["dwell"].tolist() == pytest.approx([5.5, 8.0], abs=0.02)
     assert table["visits"].tolist() == pytest.approx([2, 2], abs=0.01)
     # Only what a mode does oftener than both together.
-    assert table["actions"].str.split(", ").map(len).tolist() == [1, 1]
-    assert table["actions"].str.split(" ").str[0].tolist() == ["walk", "rest"]
+    assert table["behaviours"].str.split(", ").map(len).tolist() == [1, 1]
+    assert table["behaviours"].str.split(" ").str[0].tolist() == ["walk", "rest"]
     one = SwitchingPrior(2, 1, 0).fit(plans, generator=seeded(1))
-    assert mode_table(one, plans.without_context())["actions"].tolist() == ["walk 0.55, rest 0.45"]
+    assert mode_table(one, plans.without_context())["behaviours"].tolist() == ["walk 0.55, rest 0.45"]
     assert table.loc["rest", "enters"] == "nest 1.00"
     assert table.loc["walk", "enters"] == "hill 1.00"
 

@@ -74,7 +74,7 @@ def test_the_smallest_p_is_that_of_the_most_extreme_labelling(drug, equivalent):
     design = PermutationDesign.of(plans)
     assert design.equivalent == equivalent
     each = [
-        family_of(compare_conditions(replace(plans, condition=torch.tensor(own))), "actions").p_values
+        family_of(compare_conditions(replace(plans, condition=torch.tensor(own))), "behaviours").p_values
         for own in all_labellings(drug, sex)
     ]
     least = torch.stack(each).amin(0)
@@ -95,7 +95,7 @@ def test_what_a_stratum_has_in_common_does_not_count():
     _, shares = shares_of(plans)
     sex = np.array(SEX)
     centred = shares - np.stack([shares[sex == s].mean(0) for s in sex])
-    family = family_of(compare_conditions(plans), "actions")
+    family = family_of(compare_conditions(plans), "behaviours")
     every = sorted(all_labellings(DRUG, SEX), key=lambda own: own != tuple(DRUG))
     statistics = []
     for own in map(np.array, every):
@@ -113,7 +113,7 @@ def test_what_a_stratum_has_in_common_does_not_count():
 def test_the_difference_is_that_of_least_squares_with_strata():
     plans = stratified([[label] for label in DRUG], SEX, num_actions=3)
     plans = replace(plans, lengths=torch.tensor([60, 10, 33, 52, 25, 8, 41]))
-    family = family_of(compare_conditions(plans), "actions")
+    family = family_of(compare_conditions(plans), "behaviours")
     weight = np.sqrt(plans.lengths.numpy() / (plans.lengths.numpy() + SMOOTHING))[:, None]
     columns = np.stack([np.array(SEX) == 0, np.array(SEX) == 1, np.array(DRUG) == 1], 1).astype(float)
     slope = np.linalg.lstsq(weight * columns, weight * family.values.numpy(), rcond=None)[0][2]
@@ -131,7 +131,7 @@ def test_the_interval_of_the_difference_covers_it():
         rows = (random.random((12, 200)) < share[:, None]).astype(int)
         design = {"condition": torch.from_numpy(drug), "stratum": torch.from_numpy(sexes)}
         plans = RecordedPlans(torch.from_numpy(rows), 2, group=torch.arange(12), **design)
-        low, high = family_of(compare_conditions(plans, 9), "actions").difference[1:, 1].tolist()
+        low, high = family_of(compare_conditions(plans, 9), "behaviours").difference[1:, 1].tolist()
         outside += not low < 0.1 < high
         assert high - low < 0.4
     assert outside <= stats.binom.isf(1e-4, 100, 0.05)
@@ -276,7 +276,7 @@ def test_the_interaction_between_units_is_that_of_residuals_permuted_within_stra
         statistics.append(ratio_by_hand(fitted + (shares - fitted)[order], main, full))
     found = compare_conditions(plans, 9999, seeded(0)).interaction
     assert found.stratum_names == ["female", "male"]
-    family = family_of(found, "actions")
+    family = family_of(found, "behaviours")
     np.testing.assert_allclose(family.statistic, statistics[0], rtol=1e-6)
     # Both are of random orders; each p-value is five standard errors off with a probability below 1e-6.
     p_values = (np.array(statistics) >= statistics[0] * (1 - 1e-9)).mean(0)
@@ -290,7 +290,7 @@ def test_the_interaction_within_units_is_a_permutation_of_their_strata():
     sex = np.array([0, 0, 0, 1, 1, 1, 1])
     plans = stratified(within(7, 2), sex.tolist(), num_actions=3, length=40)
     found = compare_conditions(plans, 9999, seeded(0))
-    family = family_of(found.interaction, "actions")
+    family = family_of(found.interaction, "behaviours")
     values = found.families[0].values.numpy().reshape(7, 2, -1)
     usual = (40 * values.sum(1) + SMOOTHING * values.mean((0, 1))) / (80 + SMOOTHING)
     smoothed = (40 * values + SMOOTHING * usual[:, None]) / (40 + SMOOTHING)

@@ -212,9 +212,9 @@ def test_intervals_are_those_of_ratios_over_subjects():
     plans = by_condition()
     found = transitions(plans, 9, seeded(0), by="condition")
     frame = found.frame()
-    assert [*frame["group"].unique()] == ["all", "saline", "drug"]
+    assert [*frame["condition"].unique()] == ["all", "saline", "drug"]
     for row in frame.itertuples():
-        own = plans if row.group == "all" else plans[plans.condition == ["saline", "drug"].index(row.group)]
+        own = plans if row.condition == "all" else plans[plans.condition == ["saline", "drug"].index(row.condition)]
         per = transitions(own, 1, seeded(0)).group_counts.double()
         a, b = (plans.action_names.index(name) for name in (row[2], row.to))
         mean, low, high, _ = ratio_difference(per[:, a, b], per[:, a].sum(1))

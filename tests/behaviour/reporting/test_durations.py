@@ -63,7 +63,7 @@ def test_the_section_of_a_file(made):
     names = ["durations", "duration_laws", "next_by_duration", "dwell", "survival", "survival_tests"]
     assert list(document.tables) == names
     assert all((folder / f"{name}.csv").exists() for name in names)
-    frame = document.tables["durations"].set_index("action")
+    frame = document.tables["durations"].set_index("behaviour")
     assert frame["law"].to_dict() == {"a": "exponential", "b": "exponential", "c": "of all"}
     assert frame["zero"].to_dict() == {"a": 0, "b": 0, "c": 1}
     assert (frame["known"] + frame["unknown"]).sum() == 24 * 60
@@ -77,7 +77,7 @@ def test_the_histogram_and_the_law_are_densities(made):
     dwell = made[0].tables["dwell"]
     width = (dwell["high"] / dwell["low"]).map(log)
     for what, least in (("density", 1 - 1e-9), ("fitted", 0.97)):
-        total = (dwell[what] * width).groupby(dwell["action"]).sum()
+        total = (dwell[what] * width).groupby(dwell["behaviour"]).sum()
         assert total.between(least, 1 + 1e-9).all()
 
 
@@ -88,8 +88,8 @@ def test_the_law_is_that_of_durations_above_0():
     dwell = tables(replace(plans, durations=durations))["dwell"]
     width = (dwell["high"] / dwell["low"]).map(log)
     for what in ("density", "fitted"):
-        assert (dwell[what] * width).groupby(dwell["action"]).sum().between(0.97, 1 + 1e-9).all()
-    for name, own in dwell.groupby("action"):
+        assert (dwell[what] * width).groupby(dwell["behaviour"]).sum().between(0.97, 1 + 1e-9).all()
+    for name, own in dwell.groupby("behaviour"):
         mine = durations[plans.actions == "abc".index(name)]
         assert own["zero"].unique().tolist() == [pytest.approx(float((mine == 0).double().mean()))]
         assert own["number"].unique().tolist() == [int((mine > 0).sum())]
@@ -104,7 +104,7 @@ def test_gains_of_laws_are_held_out():
     plans = timed(False)
     times = plans.durations.clone()
     times[plans.actions == 1] = times[plans.actions == 1].sqrt()  # Weibull with shape 2
-    frame = tables(replace(plans, durations=times))["durations"].set_index("action")
+    frame = tables(replace(plans, durations=times))["durations"].set_index("behaviour")
     assert frame["law"].to_dict() == {"a": "exponential", "b": "weibull", "c": "exponential"}
     assert frame.loc["a", "gain"] == pytest.approx(0, abs=0.01)
     # log 2 + E log x - E x^2 + (log mean + 1) of a Weibull variable with shape 2 and scale 1, whatever its scale
@@ -231,10 +231,10 @@ def test_networks_with_durations():
     plans = timed(True, 64, 12)
     fits = replace(QUICK_IN_TWO, models=["gru"], inputs=["actions", "durations"], max_steps=60)
     made = report(plans, fits=fits, sections=["scores", "durations"])
-    bits = made.tables["plans"].set_index("context")["bits_per_action"]
-    assert bits["actions and durations"] < bits["actions"] - 0.1
+    bits = made.tables["scores"].set_index("input")["bits_per_behaviour"]
+    assert bits["behaviours and durations"] < bits["behaviours"] - 0.1
     row = made.tables["next_by_duration"].set_index("model").loc["gru"]
-    assert row["gain"] == pytest.approx(bits["actions"] - bits["actions and durations"])
+    assert row["gain"] == pytest.approx(bits["behaviours"] - bits["behaviours and durations"])
     with refuses("`inputs` must not hold durations"):
         report(replace(plans, durations=None), fits=replace(QUICK_IN_TWO, inputs=["durations"]))
     with refuses("`models` must hold one of combined, transformer, gru"):
@@ -247,7 +247,7 @@ def test_at_most_some_panels_are_drawn():
     figure = dwell_figure(dwell)
     assert len(figure.axes) == MOST_PANELS
     assert figure.get_suptitle() == f"the {MOST_PANELS} commonest of 16 behaviours"
-    assert len(dwell_figure(dwell[dwell["action"] == "a"]).axes) == 1
+    assert len(dwell_figure(dwell[dwell["behaviour"] == "a"]).axes) == 1
     with refuses("dwell"):
         dwell_figure(dwell[:0])
 
@@ -257,7 +257,7 @@ def test_rounded_durations_have_no_empty_bins():
     plans = timed(False)
     frames = (plans.durations * 5).ceil() / 5
     dwell = tables(replace(plans, durations=frames))["dwell"]
-    assert (dwell["density"].groupby(dwell["action"]).apply(lambda own: (own[:8] > 0).all())).all()
+    assert (dwell["density"].groupby(dwell["behaviour"]).apply(lambda own: (own[:8] > 0).all())).all()
 
 
 def test_the_parts_of_a_single_plan_are_its_units():

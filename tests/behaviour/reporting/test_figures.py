@@ -25,7 +25,7 @@ def test_dwell_times():
     """The commonest action first; bars between the edges of their bins, the law at their middles."""
     bins = [(1.0, 4.0, 0.5, 0.4), (4.0, 9.0, 0.2, 0.3)]
     actions = [("rare", 3, 0.0, "gamma"), ("usual", 50, 0.25, "weibull"), ("some", 10, 0.0, "exponential")]
-    columns = ["action", "number", "zero", "law", "low", "high", "density", "fitted"]
+    columns = ["behaviour", "number", "zero", "law", "low", "high", "density", "fitted"]
     figure = dwell_figure(pd.DataFrame([(*one, *each) for one in actions for each in bins], columns=columns))
     assert [title(axes) for axes in figure.axes] == ["usual\nweibull, 25 % at 0", "some\nexponential", "rare\ngamma"]
     for axes in figure.axes:
@@ -68,7 +68,7 @@ def test_conditions_in_an_order_of_their_own(paired):
 def test_drift_stands_at_the_middles_of_parts_and_at_the_numbers_of_plans():
     places = [("place", f"part {n}", bits, bits - 0.1, bits + 0.1) for n, bits in enumerate((2.0, 1.5, 1.2, 1.0), 1)]
     groups = [
-        ("group", name, bits, bits - 0.2, bits + 0.3) for name, bits in (("low", 1.0), ("high", 2.0), ("mid", 1.5))
+        ("subject", name, bits, bits - 0.2, bits + 0.3) for name, bits in (("low", 1.0), ("high", 2.0), ("mid", 1.5))
     ]
     drift = pd.DataFrame(places + groups, columns=["what", "name", "bits", "low", "high"])
     many = pd.DataFrame({"index": range(1, 2502), "bits": [2.0 - n / 2500 for n in range(2501)]})

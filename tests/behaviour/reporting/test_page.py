@@ -87,14 +87,14 @@ def scores(models: list[str], context: bool) -> pd.DataFrame:
     rows = [
         (model, inputs, 1 + n / 10, 0.9 + n / 10, 1.1 + n / 10)
         for n, model in enumerate(models)
-        for inputs in ("actions", "actions and context")[: 1 + context]
+        for inputs in ("behaviours", "behaviours and context")[: 1 + context]
     ]
-    return pd.DataFrame(rows, columns=["model", "context", "bits_per_action", "low", "high"])
+    return pd.DataFrame(rows, columns=["model", "input", "bits_per_behaviour", "low", "high"])
 
 
 def lags(curves: dict[str, list[tuple]]) -> pd.DataFrame:
-    rows = [(model, "actions", *row) for model, rows in curves.items() for row in rows]
-    return pd.DataFrame(rows, columns=["model", "context", "lag", "bits", "low", "high"])
+    rows = [(model, "behaviours", *row) for model, rows in curves.items() for row in rows]
+    return pd.DataFrame(rows, columns=["model", "input", "lag", "bits", "low", "high"])
 
 
 def matrix(names: list[str], seed: int = 0) -> np.ndarray:
@@ -107,7 +107,7 @@ def dwell(names: list[str]) -> pd.DataFrame:
     """Two bins an action, of times from a thousandth to days."""
     rows = [(name, n, n / 99, "gamma", 10.0**k, 10.0 ** (k + n % 5 + 1), 1 / (n + 1), None if n == 2 else 0.5)
             for n, name in enumerate(names) for k in (-3, n % 5 - 2)]  # fmt: skip
-    columns = ["action", "number", "zero", "law", "low", "high", "density", "fitted"]
+    columns = ["behaviour", "number", "zero", "law", "low", "high", "density", "fitted"]
     return pd.DataFrame(rows, columns=columns)
 
 
@@ -116,12 +116,12 @@ def figures(names: list[str], models: list[str], groups: list[str], context: boo
     by_group = np.stack([matrix(names, seed) for seed in range(len(groups))])
     ranked = scores(models, context)
     if len(models) > 1:
-        ranked.loc[len(ranked)] = {"model": "not scored", "context": "actions"}
+        ranked.loc[len(ranked)] = {"model": "not scored", "input": "behaviours"}
     motifs = pd.DataFrame({"ratio": (8.0, 0.5, 0.0, None, float("inf")), "low": (None, None, 0, None, None), "high": 4})
     plans = [(n, None if n == 3 else 1 + n / 100) for _ in groups for n in range(20)]
     steps = [*((lag, *estimate(0.5**lag, 0.01)) for lag in range(1, 9)), (9, None, None, None)]
-    drift = [("place", "", *estimate(1)), ("place", "", None, None, None), ("group", "x", None, None, None)]
-    drift += [("group", group, *estimate(1)) for group in groups]
+    drift = [("place", "", *estimate(1)), ("place", "", None, None, None), ("subject", "x", None, None, None)]
+    drift += [("subject", group, *estimate(1)) for group in groups]
     return {
         "score": score_figure(ranked),
         "lag": lag_figure(lags(dict.fromkeys(models, steps))),
@@ -285,7 +285,7 @@ def test_names_are_cut_in_the_middle():
 
 def test_scores_stand_where_they_are():
     rows = scores(["gru", "markov-1", "markov-2", "transformer"], True)
-    rows.loc[len(rows)] = ["uniform", "actions", 9.0, 9.0, 9.0]
+    rows.loc[len(rows)] = ["uniform", "behaviours", 9.0, 9.0, 9.0]
     axes = score_figure(rows).axes[0]
     assert [label.get_text() for label in axes.get_yticklabels()][::-1] == list(rows["model"][::2])
     at = {(line.get_xdata()[0], line.get_marker()) for line in axes.lines if line.get_marker() in ("o", ">")}

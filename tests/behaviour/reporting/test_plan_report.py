@@ -30,9 +30,9 @@ def chain(num: int = 12, length: int = 8, seed: int = 1, **more: Any) -> Plans:
     return markov_plans(markov_probs(3, 1, 0, 1.5), num, length, seed, **more)
 
 
-def bits(document: Document, model: str, inputs: str = "actions") -> float:
-    rows = document.frames["plans"]
-    (found,) = rows["bits_per_action"][(rows["model"] == model) & (rows["context"] == inputs)]
+def bits(document: Document, model: str, inputs: str = "behaviours") -> float:
+    rows = document.frames["scores"]
+    (found,) = rows["bits_per_behaviour"][(rows["model"] == model) & (rows["input"] == inputs)]
     return float(found)
 
 
@@ -78,7 +78,7 @@ def test_contexts_of_plans_and_of_test_plans_are_numbered_together():
         **SCORES,
     )
     for model in ("markov-0", "markov-1"):
-        assert bits(made, model, "actions and context") == bits(same, model, "actions and context")
+        assert bits(made, model, "behaviours and context") == bits(same, model, "behaviours and context")
 
 
 def test_what_has_no_actions_is_left_out_and_counted():
@@ -88,14 +88,14 @@ def test_what_has_no_actions_is_left_out_and_counted():
     made, whole = (report(some, **IN_TWO) for some in (empty, others))
     assert made.settings["sequences without behaviours, left out"] == 3
     assert "sequences without behaviours, left out" not in whole.settings
-    assert made.frames["plans"]["bits_per_action"].tolist() == whole.frames["plans"]["bits_per_action"].tolist()
+    assert made.frames["scores"]["bits_per_behaviour"].tolist() == whole.frames["scores"]["bits_per_behaviour"].tolist()
 
 
 def test_a_single_plan_is_cut_for_scores_and_described_whole():
     """What does not count is at the beginning of the plan, not of each part."""
     plans = chain(1, 300)
     made = report(plans, skip=10, fits=QUICK_IN_TWO, sections=["file", "scores"])
-    assert made.results["file"]["plans"] == 1
+    assert made.results["file"]["sequences"] == 1
     assert made.results["file"]["longest"] == 300
     assert made.settings["cut"]
     rows = [row[-1] for row in made.sections[0].tables[1].rows]
@@ -143,7 +143,7 @@ def test_saved_priors_are_scored_on_the_actions_that_count_and_known_plans_are_m
     assert marked == [True, False]
     prior = MarkovPrior(3, 1).fit(others.actions)
     expected = -prior.action_log_probs(plans)[:, skip:].mean() / math.log(2)
-    assert made.frames["plans"]["bits_per_action"][1] == pytest.approx(float(expected), abs=1e-5)
+    assert made.frames["scores"]["bits_per_behaviour"][1] == pytest.approx(float(expected), abs=1e-5)
 
 
 def test_options_of_files_reach_the_reader(tmp_path):
@@ -162,17 +162,17 @@ def test_options_of_files_reach_the_reader(tmp_path):
         return report(tmp_path / "plans.csv", priors=priors, reading=reading, sections=["file"]).results["file"]
 
     plain, gap, merged = facts(), facts(max_gap=5), facts(merge_repeats=True)
-    assert (plain["plans"], gap["plans"]) == (9, 17)
-    assert merged["actions"] < plain["actions"] == gap["actions"] == 95
+    assert (plain["sequences"], gap["sequences"]) == (9, 17)
+    assert merged["behaviours"] < plain["behaviours"] == gap["behaviours"] == 95
     labelled = facts(4, missing="label")
-    assert (labelled["actions"], labelled["kinds of actions"]) == (96, 4)
+    assert (labelled["behaviours"], labelled["kinds"]) == (96, 4)
 
 
 def test_a_report_replaces_an_earlier_one_of_its_folder(tmp_path):
     plans, fits = chain(), FitOptions(models=["counts"], folds=2, processes=1)
     first = report(plans, out=tmp_path, fits=fits, sections=["scores"])
     again = report(plans, out=tmp_path, fits=fits, sections=["scores"])
-    assert again.tables["plans"].equals(first.tables["plans"])
+    assert again.tables["scores"].equals(first.tables["scores"])
 
 
 def test_recordings_have_a_time_budget_and_a_reference(tmp_path):
@@ -186,7 +186,7 @@ def test_recordings_have_a_time_budget_and_a_reference(tmp_path):
     found = report(
         read(frame), fits=fits, sections=["recordings", "conditions"], reading=ReadOptions(reference="saline")
     )
-    budget = found.tables["time_budget"].set_index(["level", "behaviour"])
+    budget = found.tables["time_budget"].set_index(["condition", "behaviour"])
     watched = [23 if (11 + a) % 3 == 0 else 24 for a in range(6)]
     due = sum(4 / watched[a] for a in (1, 3, 5)) / 3  # "a" takes 1 of every 2, four times
     assert budget.loc[("drug", "a"), "share"] == pytest.approx(due)
@@ -209,7 +209,7 @@ def test_networks_are_trained_where_they_pay_or_are_named(pays, named, monkeypat
     monkeypatch.setattr(candidates, "screen", screened)
     models = ["counts", "gru", "combined"] if named else None
     made = report(chain(20), sections=["scores"], fits=FitOptions(models=models, folds=3, max_steps=1, processes=1))
-    found, text = set(made.frames["plans"]["model"]), " ".join(made.sections[0].text)
+    found, text = set(made.frames["scores"]["model"]), " ".join(made.sections[0].text)
     assert ("gru" in found) == (pays or named)
     assert ("promised at most: gru (0.0000), stacked (0.0000)." in text) == (not pays and not named)
     assert len(asked) == (0 if named else 2)

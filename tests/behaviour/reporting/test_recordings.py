@@ -33,13 +33,13 @@ def test_what_nobody_watched_does_not_count():
     assert each["m1", "rest"] == pytest.approx(4 / 7)
     assert each["m1", "walk"] == pytest.approx(3 / 7)
     assert each["m2", "walk"] == pytest.approx(7 / 9)
-    budget = time_budget(subject_budget(read(TABLE))).set_index(["level", "behaviour"])["share"]
+    budget = time_budget(subject_budget(read(TABLE))).set_index(["condition", "behaviour"])["share"]
     assert budget["saline", "walk"] == pytest.approx((7 / 9 + 1) / 2)
 
 
 def test_behaviours_over_time_are_shares_of_what_was_watched_then():
     """In two halves of 5 s: m1 rests 4 of 5 s, and walks 2 of the 2 s that were watched later."""
-    course = time_course(read(TABLE), bins=2).set_index(["level", "behaviour", "time"])
+    course = time_course(read(TABLE), bins=2).set_index(["condition", "behaviour", "time"])
     assert course.index.get_level_values("time").unique().tolist() == [2.5, 7.5]
     assert course.share["drug", "rest", 2.5] == pytest.approx(0.8)
     assert course.share["drug", "walk", 7.5] == pytest.approx(1)

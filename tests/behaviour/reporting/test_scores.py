@@ -50,8 +50,8 @@ def test_bits_nats_perplexity_and_differences():
     same, other = table.to_dict("records")
     half = 2.5705818356 * (3.5 / 6) ** 0.5  # the 97.5 % quantile of t with 5 degrees of freedom, times the error
     for row, ends in ((same, (2, 2, 2)), (other, (3.5, 3.5 - half, 3.5 + half))):
-        assert [row[name] for name in ("bits_per_action", "low", "high")] == pytest.approx(ends)
-        nats = [row[name] for name in ("nats_per_action", "nats_low", "nats_high")]
+        assert [row[name] for name in ("bits_per_behaviour", "low", "high")] == pytest.approx(ends)
+        nats = [row[name] for name in ("nats_per_behaviour", "nats_low", "nats_high")]
         assert nats == pytest.approx([0.6931471806 * end for end in ends])
         powers = [row[name] for name in ("perplexity", "perplexity_low", "perplexity_high")]
         assert powers == pytest.approx([2**end for end in ends])
@@ -67,7 +67,7 @@ def test_there_is_no_difference_between_scores_of_other_actions():
     first, second = evaluation(model("a", [2.0] * 6), model("b", [1.0] * 6, mask=fewer)).table().to_dict("records")
     assert first["more"] == 0
     assert pd.isna(second["more"])
-    assert second["bits_per_action"] == pytest.approx(1)
+    assert second["bits_per_behaviour"] == pytest.approx(1)
 
 
 def results(*named: tuple[str, str], number: int, bits: float) -> dict[str, np.ndarray]:
@@ -100,7 +100,7 @@ def test_the_results_of_folds_are_put_together():
     assert made.first_fold.actions.equal(PLANS.actions[held_out[0]])
     assert made.mask.equal(torch.arange(4).expand(6, 4) >= 1)
     assert tree.cost == pytest.approx(1)  # as many plans in each fold: the mean of 0, 1 and 2
-    assert made.reference == (tree, "context tree (actions)")
+    assert made.reference == (tree, "context tree (behaviours)")
     assert made.settings["folds"] == 3
 
 
@@ -120,8 +120,8 @@ def test_gains_are_those_of_the_next_lag():
     found = [{f"{name}/bits": bits, f"{name}/actions": actions} for name in ("gru", "markov") * 2]
     made = evaluate(PLANS, PLANS, Design(1), [*todo, Job(0, "counts", ACTIONS)], [*found, counts]).gains
     order = [("markov", ACTIONS), ("gru", ACTIONS), ("gru", CONTEXT), ("markov", CONTEXT)]
-    assert list(zip(made["model"], made["context"], strict=True))[::2][:2] == order[:2]
-    assert set(zip(made["model"][4:], made["context"][4:], strict=True)) == set(order[2:])
+    assert list(zip(made["model"], made["input"], strict=True))[::2][:2] == order[:2]
+    assert set(zip(made["model"][4:], made["input"][4:], strict=True)) == set(order[2:])
     assert made["lag"].tolist() == [1, 2] * 4
     assert made["bits"].tolist() == pytest.approx([1.0, 0.5] * 4)
     assert (made["units"] == 2).all()

@@ -25,7 +25,7 @@ from neuroprior.behaviour.reporting.conditions import condition_section
 from neuroprior.behaviour.reporting.fits import ACTIONS, CONTEXT
 from neuroprior.behaviour.reporting.scores import Evaluation, evaluate_saved
 from neuroprior.behaviour.reporting.sections import (
-    action_frame,
+    behaviour_frame,
     drift_section,
     file_section,
     lag_section,
@@ -81,7 +81,9 @@ def test_what_is_in_the_file(plans, found):
         rows.append([NAMES[action], str(int(counts[action])), f"{share:.1f}", str(held), f"{middle:.3g}"])
     assert cells(part, 1) == rows
     assert cells(part) == [["12", "105", "4", "20", "3", "5", "2 contexts, once a sequence"]]
-    assert action_frame(plans)["median_duration"].tolist() == pytest.approx([float(row[4]) for row in rows], rel=5e-3)
+    assert behaviour_frame(plans)["median_duration"].tolist() == pytest.approx(
+        [float(row[4]) for row in rows], rel=5e-3
+    )
 
 
 @pytest.mark.parametrize("section", [file_section, transition_section, condition_section])
@@ -118,12 +120,12 @@ def test_scores_with_their_intervals(found):
     rows = found.table()
     want = []
     for row in rows.itertuples():
-        name = {ACTIONS: "actions", CONTEXT: "actions, context"}[row.context]
-        bits = f"{row.bits_per_action:.4f}±{row.high - row.bits_per_action:.4f}"
+        name = {ACTIONS: "behaviours", CONTEXT: "+ context"}[row.input]
+        bits = f"{row.bits_per_behaviour:.4f}±{row.high - row.bits_per_behaviour:.4f}"
         more = f"{row.more:+.4f}±{row.more_high - row.more:.4f}"
-        want.append([row.model, name, f"{row.nats_per_action:.4f}", bits, f"{row.perplexity:.3f}", more])
+        want.append([row.model, name, f"{row.nats_per_behaviour:.4f}", bits, f"{row.perplexity:.3f}", more])
     assert cells(score_section(found)) == want
-    assert rows["more"].tolist() == pytest.approx((rows["bits_per_action"] - math.log2(3)).tolist(), abs=1e-6)
+    assert rows["more"].tolist() == pytest.approx((rows["bits_per_behaviour"] - math.log2(3)).tolist(), abs=1e-6)
     assert (rows["more_low"] <= rows["more"]).all()
     assert (rows["more"] <= rows["more_high"]).all()
 
@@ -162,7 +164,7 @@ def test_transitions_are_counted_in_each_group(plans, found):
             for name in ("all", plans.group_names[number]):
                 counts[name, NAMES[a], NAMES[b]] = counts.get((name, NAMES[a], NAMES[b]), 0) + 1
     frame = transition_section(found).frames["transitions"]
-    keys = [*zip(frame["group"], frame["from"], frame["to"], strict=True)]
+    keys = [*zip(frame["subject"], frame["from"], frame["to"], strict=True)]
     assert dict(zip(keys, frame["count"], strict=True)) == counts
     assert len(keys) == len(counts)
     for (name, a, b), prob in zip(keys, frame["probability"], strict=True):
@@ -196,7 +198,7 @@ def test_drift_within_plans_between_them_and_between_groups(plans, found):
     part, best = drift_section(found), found.best
     given = plans, best.bits, found.mask
     frame = part.frames["drift"]
-    places, groups = (frame[frame["what"] == what] for what in ("place", "group"))
+    places, groups = (frame[frame["what"] == what] for what in ("place", "subject"))
     want = by_position(*given).parts
     assert places[["bits", "low", "high"]].to_numpy() == pytest.approx(np.array(want), nan_ok=True)
     assert places["name"].tolist() == [f"part {n} of 10" for n in range(1, 11)]

@@ -36,7 +36,7 @@ def test_gains_of_one_fold_are_shown_and_not_starred():
     gains = pd.DataFrame([(1, 0.3, 0.1, 0.5, 9), (5, 0.1, 0.05, 0.2, 9), (6, 0.2, 0.1, 0.3, 9)])
     gains.columns = ["lag", "bits", "low", "high", "units"]
     plans = Plans(torch.randint(3, (12, 8), generator=seeded(0)), 3)
-    part = lag_section(replace(found_in(plans), gains=gains.assign(what="gain", model="markov", context="actions")))
+    part = lag_section(replace(found_in(plans), gains=gains.assign(what="gain", model="markov", input="behaviours")))
     assert part.section.tables[-1].rows == [["1", "0.3000"], ["6", "0.2000"]]  # lag 5 is in the file alone
     assert [figure.name for figure in part.section.figures] == ["lags"]
     assert not any(one.starred for one in part.findings)
@@ -80,7 +80,7 @@ def made() -> Document:
 
 def test_a_report_has_its_tables_and_figures(made):
     assert {*made.tables, "motifs"} == {
-        *("plans", "actions", "how_far_back", "lags", "transitions", "transition_test"),
+        *("scores", "behaviours", "how_far_back", "lags", "transitions", "transition_test"),
         *("motifs", "drift", "drift_tests", "rate_drift"),
         *("individuals", "individual_budget", "individual_types", "individuality", "individuality_by_behaviour"),
     }
@@ -98,9 +98,9 @@ def test_what_is_asked_for_is_done(made):
 
 
 def test_the_lead_names_the_best_model(made):
-    best = made.tables["plans"].sort_values("bits_per_action").iloc[0]
+    best = made.tables["scores"].sort_values("bits_per_behaviour").iloc[0]
     assert (
-        f"The best model, {best.model}, takes {best.bits_per_action:.3f} bits per behaviour"
+        f"The best model, {best.model}, takes {best.bits_per_behaviour:.3f} bits per behaviour"
         f" (95 % interval {best.low:.3f} to {best.high:.3f} over subjects)."
     ) in made.said
 
@@ -111,12 +111,12 @@ def test_plans_in_memory_and_in_a_file_have_the_same_report(tmp_path, made):
     plans = markov_plans(markov_probs(3, 1, 0, 1.5), 24, 8, 1, group=torch.arange(24) % 6)
     write_plans(plans, tmp_path / "plans.npz")
     again = report(tmp_path / "plans.npz", sections=["scores"], out=tmp_path / "out", **ASKED)
-    pd.testing.assert_frame_equal(again.tables["plans"], made.tables["plans"])
+    pd.testing.assert_frame_equal(again.tables["scores"], made.tables["scores"])
     assert (made.title, again.title) == ("Report", "Report on plans.npz")
     assert {path.name for path in (tmp_path / "out").glob("[!.]*")} == {
         "report.html",
         "results.json",
-        "plans.csv",
+        "scores.csv",
         "folds",
     }
 
@@ -175,7 +175,7 @@ def test_few_groups_bear_no_verdict(number, enough):
     assert ("significant" in said) == enough
     assert ("p" in said.split("\n")) == enough  # the heading of a column
     assert said.count(few) == (0 if enough else 7)  # the lead, and each section that would draw one
-    assert whole.tables["plans"]["low"].notna().all()
+    assert whole.tables["scores"]["low"].notna().all()
     assert "over subjects" in " ".join(whole.said)
 
 
@@ -201,7 +201,7 @@ def test_actions_that_never_occur_count_in_uniform_and_the_report_says_so(names,
     actions, number = torch.randint(2, (30, 8), generator=seeded(0)), 6 if names is None else len(names)
     plans = Plans(actions * 2 + 1 if number == 6 else actions, number, action_names=names)
     made = report(plans, fits=QUICK_IN_TWO, sections=["file", "scores"])
-    assert made.frames["plans"].set_index("model")["bits_per_action"]["uniform"] == pytest.approx(math.log2(number))
+    assert made.frames["scores"].set_index("model")["bits_per_behaviour"]["uniform"] == pytest.approx(math.log2(number))
     captions = [table.caption for section in made.sections for table in section.tables]
     assert sum("never" in caption for caption in captions) == 2 * bool(listed)
     if listed:

@@ -35,7 +35,7 @@ def test_studies_with_and_without_an_effect(tmp_path, capsys):
     assert {row["design"] for row in found["rows"]} == {*command.DESIGNS}
     assert all(row["studies"] == 2 for row in found["rows"])
     assert len(found["rows"]) == 8 * len(command.DESIGNS) + 1
-    levels = {row["design"]: row["level"] for row in found["rows"] if row["test"] == "actions"}
+    levels = {row["design"]: row["level"] for row in found["rows"] if row["test"] == "behaviours"}
     # Nine of 200 random labellings are less than 5 %.
     assert [*levels.values()] == pytest.approx([0.045] * len(levels))
     assert all(row["power_low"] <= row["power"] <= row["power_high"] for row in found["rows"])
@@ -59,7 +59,7 @@ def test_studies_with_and_without_an_effect(tmp_path, capsys):
 def test_each_study_has_a_seed_of_its_own(effect, number, seeds, monkeypatch):
     """Eleven studies without an effect, two with one, from seed 5."""
     done = SimpleNamespace(
-        tests={"actions": (0.1, 0.2)}, p_value=0.3, families=[], interaction=None, smallest_p=2 / 924
+        tests={"behaviours": (0.1, 0.2)}, p_value=0.3, families=[], interaction=None, smallest_p=2 / 924
     )
     drawn = []
     monkeypatch.setattr(
@@ -68,7 +68,7 @@ def test_each_study_has_a_seed_of_its_own(effect, number, seeds, monkeypatch):
     numbers = {"studies": 11, "with_effect": 2, "seed": 5, "actions": 10, "permutations": 99}
     rows = command.compared(numbers, command.Batch("8 paired", effect, number))
     assert drawn == list(seeds)
-    each = [("actions", 0.1, 0.2), ("all together", 0.3, 0.3), ("any star", 1.0, 1.0)]
+    each = [("behaviours", 0.1, 0.2), ("all together", 0.3, 0.3), ("any star", 1.0, 1.0)]
     level = pytest.approx(46 / 924)
     assert [tuple(row.values()) for row in rows] == [("test", seed, level, *one) for seed in seeds for one in each]
 
