@@ -104,11 +104,13 @@ def rows_of(job: Job, num_sequences: int) -> list[dict[str, Any]]:
             for known, some in ((forecasts, held_out), (of_test, test))
         )
         row = {"data": job.data, "actions": int(plans.mask().sum()), "network": type(network).__name__}
-        row |= promise._asdict() | {"promised": promise.gain, "trained": promise.pays}
+        tried = all(earlier["trained"] for earlier in rows)  # up to the first that does not pay
+        pays = promise.pays and tried
+        row |= promise._asdict() | {"promised": promise.gain, "trained": pays}
         row |= {"held_out": _loss(forecasts, held_out) - _loss(joined, held_out)}
         row |= {"gain": _loss(of_test, test) - _loss(joined_test, test)}
-        rows.append(row | {"screening_seconds": screened - begun, "training_seconds": seconds})
-        if promise.pays:
+        rows.append(row | {"screening_seconds": (screened - begun) * tried, "training_seconds": seconds})
+        if pays:
             forecasts, of_test = joined, joined_test
     return rows
 

@@ -1,18 +1,21 @@
 """`neuroprior score`: how probable plans are under a saved prior."""
 
 from dataclasses import replace
+from math import log
 from pathlib import Path
 
+import torch
 from rich.console import Console
 
 from neuroprior._folders import claim, claim_out
-from neuroprior.behaviour.analysis.comparison import action_bits, score_bits, too_few, unit_name
+from neuroprior.behaviour.analysis.comparison import score_bits, too_few, unit_name
 from neuroprior.behaviour.durations.past_durations import PastDurations
+from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.reporting.document import printed, table, write_frames
 from neuroprior.behaviour.reporting.options import ReadOptions, is_recording, name_files
 from neuroprior.priors import load
 from neuroprior.priors.matching import learned_names, match_plans, numbered_note, taken_note, with_contexts_of
-from neuroprior.priors.scoring import learned_from, scores_by
+from neuroprior.priors.scoring import learned_from, log_probs_after, scores_by
 
 UNITS = ("plan", "group", "condition")
 """What has a table of its own, if the plans have it."""
@@ -26,6 +29,7 @@ def score(
     folder: str,
     files: list[str],
     out: str = "runs/score",
+    past: list[str] | None = None,
     reading: ReadOptions = ReadOptions(),  # noqa: B008
 ) -> None:
     """Score plans under a saved prior: log-likelihood and bits per action, of each plan and each group.
@@ -36,23 +40,33 @@ def score(
         folder: a saved prior, as `neuroprior fit` writes it.
         files: of behaviour (see `neuroprior.behaviour.read`), or of plans: `.npz`, `.jsonl`, or `minari:` and the name
             of a Minari dataset.
+        past: files of what the same subjects did before; a prior that learns along a sequence begins with it.
         out: folder for `plans.csv` and, where there are any, `groups.csv` and `conditions.csv`.
         reading: how files are read.
     """
     prior, place = load(folder), Path(out)
-    known = learned_names(prior)
-    tabular = is_recording(files)
-    # Numbers in a table are the prior's own; its names make sure that there are as many.
-    plans = replace(reading, action_names=reading.action_names or (known if tabular else None)).read(files)
-    plans = plans if plans.end is None else plans.without_end()
-    plans, notes = with_contexts_of(prior, plans, tabular)
-    own, past = match_plans(plans, prior, folder), PastDurations.load(Path(folder))
-    own = own if past is None else past.added_to(own)
+    known, durations = learned_names(prior), PastDurations.load(Path(folder))
+
+    def read(some: list[str]) -> tuple[RecordedPlans, RecordedPlans, list[str]]:
+        """The plans of files, the same as the prior numbers them, and notes."""
+        tabular = is_recording(some)
+        # Numbers in a table are the prior's own; its names make sure that there are as many.
+        plans = replace(reading, action_names=reading.action_names or (known if tabular else None)).read(some)
+        plans = plans if plans.end is None else plans.without_end()
+        plans, notes = with_contexts_of(prior, plans, tabular)
+        matched = match_plans(plans, prior, folder)
+        return plans, matched if durations is None else durations.added_to(matched), notes
+
+    if past is not None and (twice := {Path(one).resolve() for one in files} & {Path(one).resolve() for one in past}):
+        raise ValueError(f"`past` must hold other files than those that are scored, got {min(twice)}.")
+    plans, matched, notes = read(files)
+    earlier = None if past is None else read(past)[1]
     units = [by for by in UNITS if by == "plan" or getattr(plans, by) is not None]
     with claim(place) as claimed:
         claimed.check(f"{by}s.csv" for by in units)
-    bits = action_bits(prior, own)
-    whole = score_bits(folder, "", bits, own).bits_per_action()
+    with torch.no_grad():
+        bits = -log_probs_after(prior, matched, earlier).double().cpu() / log(2)
+    whole = score_bits(folder, "", bits, matched).bits_per_action()
     learned = learned_from(Path(folder), plans)
     frames = {f"{by}s": scores_by(bits, plans, by, learned) for by in units}
     name = "groups" if "groups" in frames else "plans"

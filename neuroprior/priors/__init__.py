@@ -1,6 +1,6 @@
 """Priors: distributions over action sequences, learned from plans, that samplers step through."""
 
-from neuroprior.priors.adaptive import AdaptivePrior
+from neuroprior.priors.adaptive import AdaptivePrior, adapt
 from neuroprior.priors.counts import ContextTreePrior, Leaf, MarkovPrior
 from neuroprior.priors.ensembles import CombinedPrior, MixturePrior, StackedPrior
 from neuroprior.priors.fitting import fit
@@ -28,6 +28,7 @@ __all__ = [
     "SwitchingPrior",
     "TransformerPrior",
     "UniformPrior",
+    "adapt",
     "decode",
     "fit",
     "load",

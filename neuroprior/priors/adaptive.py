@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from math import inf, log
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import torch
@@ -40,6 +40,9 @@ PAIRS_AT_ONCE = 2**24
 """Pairs of actions, a present and a past one, that are compared at once; bounds memory."""
 
 
+AnyPrior = TypeVar("AnyPrior", bound=Prior)
+
+
 class AdaptivePrior(Prior):
     """A base prior whose predictions are drawn towards what was done before in the same sequence.
 
@@ -54,7 +57,7 @@ class AdaptivePrior(Prior):
     likeliest. With a `decay` below 1 old counts fade: each time the k actions come again, what followed them before
     counts so many times less.
 
-    Counts begin at zero with each sequence, or with those of earlier sequences of an individual, see `adapted_to`.
+    Counts begin at zero with each sequence, or with those of earlier sequences of an individual, see `adapt`.
 
     Args:
         base: a prior; or, as in a saved `config`, an object with `prior`, the name of its class, and its `config`.
@@ -265,15 +268,6 @@ class AdaptivePrior(Prior):
                 parts.append((taken[0], torch.stack(taken[1:]), torch.stack(totals)))
         return join_columns(parts)
 
-    def adapted_to(self, plans: Plans | Tensor) -> "AdaptivePrior":
-        """Return a copy that begins each sequence with the counts of an individual's earlier ones.
-
-        Its counts add up: `prior.adapted_to(first).adapted_to(second)` has counted in both. See `count`.
-        """
-        adapted = deepcopy(self)
-        adapted.count(plans)
-        return adapted
-
     @torch.no_grad()
     def individual_log_probs(self, plans: Plans) -> Tensor:
         """The log-probability of each action, given those before it and all earlier plans of its group.
@@ -331,6 +325,36 @@ class AdaptivePrior(Prior):
             counts = (windows * place).sum(-1).bincount(minlength=self.num_actions ** (level + 1))
             earlier, counts = getattr(self, name), counts.view(-1, self.num_actions).float()
             self.register_buffer(name, retention * earlier + counts if len(earlier) else counts)
+
+
+def adapt(prior: AnyPrior, plans: Plans | Tensor) -> AnyPrior:
+    """Return a copy of a prior that begins each sequence with the counts of an individual's earlier ones.
+
+    Counts add up: `adapt(adapt(prior, first), second)` has counted in both. A planner whose candidates come from the
+    copy follows what the individual did.
+
+    Args:
+        prior: an `AdaptivePrior`, or one with such experts, as the combined prior has where plans are long.
+        plans: earlier ones of the individual; nothing fades within them. A tensor is int64 `[N, L]`.
+
+    Raises:
+        ValueError: nothing in the prior learns along a sequence; other actions than the prior's, or tables that would
+            not fit into memory.
+
+    Example:
+        >>> adapt(AdaptivePrior(UniformPrior(2), [2.0]), torch.tensor([[0, 0]])).log_prob(torch.tensor([[0]])).exp()
+        tensor([0.7500])
+    """
+    adapted = deepcopy(prior)
+    parts = [part for part in adapted.modules() if isinstance(part, AdaptivePrior)]
+    if not parts:
+        raise ValueError(
+            f"`prior` must learn along a sequence, as an `AdaptivePrior` does, or a combined prior of sequences of a"
+            f" hundred actions or more; this {type(prior).__name__} does not."
+        )
+    for part in parts:
+        part.count(plans)
+    return adapted
 
 
 def join_columns(parts: Sequence[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:

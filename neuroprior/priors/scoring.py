@@ -9,11 +9,14 @@ from math import log
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from neuroprior._files import read_json, write_json
 from neuroprior.plans import Plans
+from neuroprior.priors.adaptive import adapt
+from neuroprior.priors.learning import plans_for
 from neuroprior.priors.matching import match_plans
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.serialization import MODEL, digest, load
@@ -22,7 +25,7 @@ LEARNED = "learned.json"
 """In the folder of a saved prior: the digests of the plans that it has learned from, at least in part."""
 
 
-def score(prior: Prior | str | os.PathLike[str], plans: Plans, by: str = "plan") -> Any:
+def score(prior: Prior | str | os.PathLike[str], plans: Plans, by: str = "plan", *, past: Plans | None = None) -> Any:
     """The log-likelihood of plans under a prior, summed by plan, by action, or by group.
 
     Args:
@@ -31,6 +34,7 @@ def score(prior: Prior | str | os.PathLike[str], plans: Plans, by: str = "plan")
             end symbol of the prior, see `match_plans`).
         by: what a row is: "plan", "action", "group", or what else a subclass of `Plans` has for each plan, such as
             "condition".
+        past: earlier plans of the same groups, see `log_probs_after`; None: each plan stands alone.
 
     Returns:
         A pandas frame: `by`; `plans` and `actions`, how many (of a plan `actions` alone, its number, and its `group`
@@ -39,7 +43,7 @@ def score(prior: Prior | str | os.PathLike[str], plans: Plans, by: str = "plan")
         plans the prior has learned from, at least in part (of a group: how many): their bits are too low.
 
     Raises:
-        ValueError: the prior does not know the actions or contexts, or plans have no groups.
+        ValueError: the prior does not know the actions or contexts, plans have no groups, or see `log_probs_after`.
 
     Example:
         >>> plans = Plans(torch.tensor([[0, 1, 2], [2, 1, 0]]), 3, group=torch.tensor([0, 1]))
@@ -55,10 +59,39 @@ def score(prior: Prior | str | os.PathLike[str], plans: Plans, by: str = "plan")
             f" {type(prior).__name__}"
         )
     with torch.no_grad():
-        log_probs = prior.action_log_probs(match_plans(plans, prior))
+        earlier = None if past is None else match_plans(past, prior)
+        log_probs = log_probs_after(prior, match_plans(plans, prior), earlier)
     plans = plans if plans.end is None else plans.without_end()
     learned = None if folder is None else learned_from(Path(folder), plans)
     return scores_by(-log_probs.cpu().double() / log(2), plans, by, learned)
+
+
+def log_probs_after(prior: Prior, plans: Plans, past: Plans | None) -> Tensor:
+    """The log-probability of each action where the counts of a group, an individual, begin with its earlier plans.
+
+    Args:
+        prior: fitted; with `past` it learns along a sequence, see `neuroprior.priors.adapt`.
+        plans: N of them, with groups; those of a group without earlier plans are scored alone.
+        past: earlier plans; groups are the same by name, or by number where there are no names. None: there are none.
+
+    Returns:
+        `[N, L]`, nats, as `Prior.action_log_probs`.
+
+    Raises:
+        ValueError: plans without groups, no group in both, or a prior that does not learn along a sequence.
+    """
+    log_probs = prior.action_log_probs(plans_for(prior, plans))
+    if past is None:
+        return log_probs
+    if plans.group is None or past.group is None:
+        raise ValueError("`past` must have groups, as `plans` must: the individuals whose counts go on.")
+    groups, earlier = (np.array(_names(each, "group"), dtype=object) for each in (plans, past))
+    if not (both := [name for name in dict.fromkeys(groups) if name in set(earlier)]):
+        raise ValueError("`past` must hold plans of a group of `plans`: there is none.")
+    for name in both:
+        own, before = (torch.from_numpy(names == name) for names in (groups, earlier))
+        log_probs[own] = adapt(prior, past[before]).action_log_probs(plans_for(prior, plans[own]))
+    return log_probs
 
 
 def scores_by(bits: Tensor, plans: Plans, by: str, learned: list[bool] | None = None) -> Any:

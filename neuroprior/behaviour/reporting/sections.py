@@ -157,7 +157,8 @@ def _not_trained(found: Evaluation) -> list[str]:
     names = listed([f"{name.replace(',', '')} ({max(bits, 0):.4f})" for name, bits in found.promises.items()])
     return [
         "Networks are trained where a tenth of their training, in the first fold, promises enough to be kept. Not"
-        f" trained, with the bits per behaviour that they promised at most: {names}. `--effort full` trains all."
+        f" trained, with the bits per behaviour that they promised at most: {names}. After the first that promises too"
+        " little no other is tried; `--effort full` trains all."
     ]
 
 

@@ -74,7 +74,7 @@ class Experts(NamedTuple):
     Attributes:
         counting: those that count.
         networks: those that are trained, by name.
-        left_out: by name, what networks promised that were not trained for it.
+        left_out: by name, what the network promised that was not trained for it; those behind it were not tried.
     """
 
     counting: list[Prior]
@@ -107,7 +107,7 @@ def fitted_experts(
         settings: of their training. Networks share the `seconds` that are left when all has been counted, if these are
             limited; those for which nothing is left are not trained. A quarter of the share of each is for screening.
         names: of the networks that are trained; None: those that promise to bring something beyond the experts that
-            count, see `screen`, and with the full effort all.
+            count, see `screen`, up to the first that does not; with the full effort all.
     """
     seconds = settings.get("seconds")
     until = inf if seconds is None else monotonic() + seconds
@@ -127,7 +127,7 @@ def fitted_experts(
                 if shown:
                     of_needed = f"{promise.gain:.4f} of {promise.needed:.4f} nats per action"
                     print(f"{name}: not trained, as it promises {of_needed}", file=sys.stderr, flush=True)
-                continue
+                break  # what a network that sees the whole past cannot find, those behind it cannot either
         if until <= monotonic():
             break
         prior.fit(plans_for(prior, learned), generator=generator, **_within(how, until, others))
