@@ -18,7 +18,7 @@ from neuroprior import (
     oracle,
 )
 from neuroprior.worlds import cube
-from tests.support.sources import random_world, refuses, seeded, stochastic_world
+from tests.support.sources import random_world, seeded
 
 
 @settings(deadline=None, max_examples=40)
@@ -213,27 +213,6 @@ def test_the_start_that_took_most_steps_tells_how_many():
     assert planner.plan(world, state[:1], seeded(0)).model_steps == 4 + 3 + 2 + 1
     planner.steps_at_once = 1
     assert planner.plan(world, state, seeded(0)).model_steps == together == 24
-
-
-@pytest.mark.parametrize(
-    ("given", "word"),
-    [
-        ({"length": 0}, "length"),
-        ({"num_plans": 0}, "num_plans"),
-        ({"temperature": 0.0}, "temperature"),
-        ({"exploration": -1.0}, "exploration"),
-        ({"exploration": float("nan")}, "exploration"),
-    ],
-)
-def test_refuses(given, word):
-    with refuses(word):
-        MCTSPlanner(UniformPrior(4), **({"length": 2, "num_plans": 2} | given))
-
-
-def test_refuses_stochastic_worlds():
-    world = stochastic_world(0)
-    with refuses("deterministic"):
-        MCTSPlanner(UniformPrior(world.num_actions), 2, 2).plan(world, torch.zeros(1, dtype=torch.long))
 
 
 @pytest.mark.parametrize(("length", "num_plans"), [(3, 8), (5, 6)])

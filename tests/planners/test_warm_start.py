@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from neuroprior import MarkovPrior, SamplingPlanner, TabularWorld, UniformPrior, gridworld
+from neuroprior import SamplingPlanner, TabularWorld, UniformPrior, gridworld
 from neuroprior.planners import Decision, expected_score
 from neuroprior.planners.warm_start import continue_plans, with_rest
 from neuroprior.worlds import labyrinth
@@ -98,16 +98,6 @@ def test_in_a_stochastic_world_both_have_the_same_rollouts():
     ]
     assert worth[0] < worth[1] <= worth[2] + 0.01
     assert not torch.equal(chosen.plan, decision.plan)
-
-
-def test_the_context_is_the_observation_where_the_rest_leads():
-    world = gridworld(4, 4)
-    state = world.reset(50, seeded(0))
-    prior = MarkovPrior(4, 1, num_contexts=16)
-    plans, _ = continue_plans(
-        prior, world, state, torch.zeros(50, 2, dtype=torch.long), torch.full((50,), 2), 4, seeded(0)
-    )
-    assert (plans[:, 0, :2] == 0).all()
 
 
 def test_in_a_stochastic_world_nothing_beyond_the_end_of_a_plan_wins():

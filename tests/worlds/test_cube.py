@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from neuroprior import SamplingPlanner, UniformPrior
+from neuroprior.testing import check_world
 from neuroprior.worlds import cube
 from tests.support.sources import FALSE_ALARM, p_value, refuses, seeded
 
@@ -48,11 +49,6 @@ def after(world, moves, start=0):
     for move in moves.split():
         state, reward = world.step(state, torch.tensor([world.action_names.index(move)]))
     return int(state), float(reward)
-
-
-def test_moves():
-    assert cube().action_names == ("U", "U2", "U'", "R", "R2", "R'", "F", "F2", "F'")
-    assert cube("quarter").action_names == ("U", "U'", "R", "R'", "F", "F'")
 
 
 @pytest.mark.parametrize("turns", ["half", "quarter"])
@@ -108,14 +104,17 @@ def test_distances(turns, known):
     assert lost.tolist() == [*(-world.distance(after[:5])).tolist(), 0]
 
 
-def test_of_an_absorbing_cube_only_arriving_is_rewarded():
-    for absorbing, after, reward in ((True, [0, 0], [0, 1]), (False, None, [0, 1])):
-        world = cube("quarter", absorbing=absorbing)
-        turned, nothing = cube("quarter").step(torch.tensor([0]), torch.tensor([0]))
-        there, gained = world.step(torch.tensor([0, int(turned)]), torch.tensor([0, 1]))
-        assert there.tolist() == (after or [int(turned), 0])
-        assert (gained.tolist(), nothing.tolist()) == (reward, [0])
-        assert world.terminated(there).tolist() == ([True, True] if absorbing else [False, False])
+def test_the_solved_cube_may_be_the_end():
+    world, free = cube(absorbing=True), cube()
+    state = torch.arange(2000).repeat_interleave(9)
+    action = torch.arange(9).repeat(2000)
+    after, reward = world.step(state, action)
+    want, gained = free.step(state, action)
+    assert torch.equal(world.terminated(state), state == 0)
+    assert not free.terminated(state).any()
+    assert torch.equal(after, torch.where(state == 0, 0, want))
+    assert torch.equal(reward, torch.where(state == 0, 0.0, gained))
+    check_world(world)
 
 
 def test_the_cube_is_solved_in_one_state():
