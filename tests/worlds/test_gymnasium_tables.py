@@ -93,18 +93,6 @@ def test_the_best_walk_along_the_cliff_takes_thirteen_steps():
     assert [float(oracle(world, start, length, objective="return")) for length in (12, 13, 20)] == [-12, -13, -13]
 
 
-def test_layouts_and_moving_a_world():
-    world = from_gymnasium("Taxi-v4").to("cpu")
-    assert world.num_layouts == 1
-    assert world.layout(world.reset(7)).tolist() == [0] * 7
-
-
-@pytest.mark.parametrize("name", TOYS)
-def test_tables_conform(name):
-    check_world(from_gymnasium(name))
-    check_world(from_gymnasium(name, starts="any"))
-
-
 def test_an_end_that_is_also_passed_through_gets_a_state_of_its_own():
     """From 1 the episode may end in 2, or go on from there."""
 
