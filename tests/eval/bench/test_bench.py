@@ -346,14 +346,3 @@ def test_what_is_not_installed_is_left_out():
     assert not list(against_peers("shoot", SMALL, 1, said.append, missing=lambda package: package is not None))
     assert "fit_tree: vlmc (Rust) left out, vlmc is not installed" in said
     assert "shoot: left out, minigrid is not installed" in said
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [(["--scale", "0"], "scale"), (["--jobs", "sing"], "jobs")],
-)
-def test_bad_input_is_one_line(arguments, words, capsys):
-    assert main(["bench", *arguments]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert words in error

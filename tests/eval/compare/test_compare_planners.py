@@ -53,23 +53,6 @@ def test_a_small_comparison(tmp_path, capsys, monkeypatch):
     assert json.loads((out / "results.json").read_text())["rows"] == rows
 
 
-@pytest.mark.parametrize(
-    ("given", "says"),
-    [
-        (["best"], "sampling"),
-        (["mcts", "mcts"], "planners: each may be given"),
-        (["mcts", "--worlds", "grid", "slippery"], "planners: none of mcts is for slippery"),
-        (["halving", "--worlds", "grid"], "planners: none of halving is for grid"),
-    ],
-)
-def test_bad_planners_are_one_line(given, says, tmp_path, capsys):
-    assert main(["compare", "--planners", *given, "--out", str(tmp_path / "out")]) == 2
-    error = capsys.readouterr().err
-    assert says in error
-    assert len(error.splitlines()) == 1
-    assert not (tmp_path / "out").exists()
-
-
 def results(gap, seeds=4, worlds=("maze",)):
     """Samples that reach .5 to .53, and trees that reach `gap` more."""
 

@@ -165,25 +165,3 @@ def test_aggregates_over_worlds_are_shares_of_the_oracle():
     assert (online["worlds"], online["seeds"], online["improvement"]) == (2, 6, 1)
     assert online["first"] == pytest.approx(0.205 / 0.505, abs=0.02)
     assert online["second"] == pytest.approx(0.105 / 0.505, abs=0.02)
-
-
-@pytest.mark.parametrize(
-    ("given", "word"),
-    [
-        (["--worlds", "nowhere"], "nowhere"),
-        (["--kinds", "markov", "markov"], "kinds"),
-        (["--seeds", "0"], "seeds"),
-        (["--period", "100"], "`period` must be a multiple of 64"),
-        (["--length", "6"], "length"),
-        (["--items", "20"], "items"),
-        (["--agents", "0"], "agents"),
-        (["--processes", "0"], "processes"),
-        (["--seed", "-1"], "seed"),
-    ],
-)
-def test_bad_options(given, word, tmp_path, capsys):
-    assert main([*SMALL, *given, "--out", str(tmp_path)]) == 2
-    text = capsys.readouterr().err
-    assert text.count("\n") == 1
-    assert word in text
-    assert not list(tmp_path.iterdir())

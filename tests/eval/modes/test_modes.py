@@ -149,8 +149,3 @@ def test_two_modes_of_the_mice_come_back(tmp_path):
     assert (tmp_path / "modes.png").read_bytes().startswith(b"\x89PNG")
     turns = [row["mean"] for row in results["modes"] if row["what"] == "turns"]
     assert turns[0] < 0.5 < turns[1]
-
-
-def test_a_number_twice_is_refused(tmp_path, capsys):
-    assert main(["modes", "--modes", "2", "2", "--out", str(tmp_path)]) == 2
-    assert "modes: each may be given once" in capsys.readouterr().err

@@ -173,21 +173,3 @@ def test_only_priors_with_the_same_context_are_paired():
     assert macro["context"].tolist() == ["none"] * 2
     assert macro[["first", "second"]].to_numpy().tolist() == [[0.1, 0.3], [0.1, 0.4]]
     assert ("switching-2", "flat-2") in pairs((2,))
-
-
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (["--worlds", "taxi"], "worlds"),
-        (["--lengths", "501"], "`lengths` must be integers from 1 to 500"),
-        (["--starts", "127"], "`starts` must be integers from 1 to 126"),
-        (["--modes", "2", "2"], "modes: each may be given once"),
-        (["--num-plans", "0"], "num_plans"),
-    ],
-)
-def test_bad_options_are_one_line(options, says, tmp_path, capsys):
-    assert main(["options", *options, "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert says in said
-    assert "Traceback" not in said
-    assert not (tmp_path / "out").exists()

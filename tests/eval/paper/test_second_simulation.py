@@ -8,8 +8,7 @@ import torch
 from eval.paper.planners import PaperSettings
 from eval.paper.second_simulation import ceiling, empty_world, objective, pursue, random_starts
 from eval.paper.value_quality import families, quality
-from eval.paper.values import can_reach
-from neuroprior import ExhaustivePlanner, SamplingPlanner, TabularWorld, UniformPrior, collect, oracle
+from neuroprior import ExhaustivePlanner, SamplingPlanner, TabularWorld, UniformPrior, oracle
 from neuroprior.planners import value_iteration
 from neuroprior.testing import FALSE_ALARM
 from neuroprior.testing.chi_square import chi_square
@@ -149,13 +148,6 @@ def test_best_prefixes_are_legal_and_ties_uniform() -> None:
     assert chi_square(code.bincount(minlength=3).double(), torch.full((3,), 4000.0)) > FALSE_ALARM
 
 
-def test_collect_keeps_the_lengths() -> None:
-    plans = collect(ExhaustivePlanner(3, any_prefix=True), random_table(2), 50, generator=generator())
-    assert plans.lengths is not None
-    assert set(plans.lengths.tolist()) <= {1, 2, 3}
-    assert len(set(plans.lengths.tolist())) > 1
-
-
 def test_worse_values_are_of_lower_quality() -> None:
     t = settings(size=12)
     exact = value_iteration(empty_world(t, 1), goal=t.goal)[0]
@@ -163,16 +155,3 @@ def test_worse_values_are_of_lower_quality() -> None:
         found = [quality(values, exact, t.goal) for values in levels.values()]
         assert found[-1] > found[0], kind
         assert max(found) <= 1 + 1e-9
-
-
-def test_ceiling_bounds_every_start() -> None:
-    t = settings(size=8, max_plans=2, length=3)
-    world = empty_world(t, 2)
-    values = torch.rand(2, 64, generator=generator(4))
-    states = random_starts(t, 2, 300, generator())
-    for any_prefix in (False, True):
-        planner = SamplingPlanner(UniformPrior(4), 3, 64, value=objective(values, t.goal), any_prefix=any_prefix)
-        done = pursue(planner, world, states.flatten(), t.goal, 2, generator(1))
-        able = can_reach(world, states.flatten(), t.goal, 6, within=True) if any_prefix else ceiling(world, states, t)
-        assert not bool((done.reached & ~able.flatten()).any())
-        assert bool(done.reached.any())

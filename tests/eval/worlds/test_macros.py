@@ -63,24 +63,6 @@ def test_macros_are_those_found_by_hand(plans):
         assert [action for symbol in predicted for action in meaning[symbol]] == plan
 
 
-def test_what_plans_repeat_is_found():
-    """Plans of three words among noise: the words are found."""
-    words = [(0, 1, 2, 3), (3, 3, 1), (2, 0, 0)]
-    generator = seeded(0)
-    plans = []
-    for _ in range(400):
-        plan = []
-        while len(plan) < 24:
-            k = int(torch.randint(5, (), generator=generator))
-            plan += words[k] if k < 3 else [int(torch.randint(4, (), generator=generator))]
-        plans.append(plan[:24])
-    macros, _ = learn_macros(Plans(torch.tensor(plans), 4), 12)
-    found = {macro.actions for macro in macros}
-    assert (0, 1, 2, 3) in found
-    assert len(found & set(words)) >= 2
-    assert macros[0].gain > 100
-
-
 def all_ways(plan, macros, actions):
     """All sequences of symbols that read as a plan, the last of them perhaps cut off."""
     meaning = [(a,) for a in range(actions)] + [macro.actions for macro in macros]
