@@ -15,7 +15,7 @@ from neuroprior.behaviour import read
 from neuroprior.behaviour.analysis.comparison import score
 from neuroprior.behaviour.reporting.document import records
 from neuroprior.behaviour.reporting.plan_report import report
-from neuroprior.plans import read_plans, write_plans
+from neuroprior.plans import write_plans
 from tests.support.events import write_events
 from tests.support.sources import seeded
 
@@ -174,19 +174,6 @@ def test_contexts_are_known_by_name(make, kind, tmp_path):
     assert read(tmp_path / "new.csv").plans().context_names == ("cold", "warm")
     rows = evaluate(tmp_path / "new.csv", [folder])
     assert rows[0]["context"] == "actions and context"
-    assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), new), abs=1e-6)
-
-
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.int32, torch.int64])
-@pytest.mark.parametrize("kind", ["plan", "step"])
-def test_contexts_of_any_integer_type(kind, dtype, tmp_path):
-    """`.npz` files keep the type of their context."""
-    learned, new = in_contexts(kind=kind), in_contexts(40, 9, kind)
-    folder = saved(MarkovPrior(3, 1, num_contexts=3), learned, tmp_path / "prior")
-    turned = replace(new, context=((new.context + 1) % 3).to(dtype), context_names=("warm", "cold", "mild"))
-    write_plans(turned, tmp_path / "new.npz")
-    assert read_plans(tmp_path / "new.npz").context.dtype == dtype
-    rows = evaluate(tmp_path / "new.npz", [folder])
     assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), new), abs=1e-6)
 
 

@@ -264,14 +264,6 @@ def test_a_file_alone_is_learned_by_the_combined_prior(plans_file, tmp_path):
     assert load(tmp_path / "other").log_prob(some_plans(60)).equal(prior.log_prob(some_plans(60)))
 
 
-def test_a_long_sequence_is_read_in_windows(tmp_path):
-    write_plans(Plans((torch.arange(6000) // 3 % 4)[None], 4), tmp_path / "plans.npz")
-    exactly = ["--window", "16", "--prior.dropout", "0", "--prior.lags", "16", "--max_steps", "120"]
-    assert main([*small("gru", tmp_path / "run"), str(tmp_path / "plans.npz"), *exactly]) == 0
-    assert metrics(tmp_path / "run")["unit"] == "parts of the sequence"
-    assert metrics(tmp_path / "run")["rows"][-1]["bits_per_action"] < 0.5
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

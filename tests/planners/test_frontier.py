@@ -6,18 +6,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import (
-    ExhaustivePlanner,
     GRUPrior,
     MarkovPrior,
     Plans,
     SamplingPlanner,
     TabularWorld,
     UniformPrior,
-    collect,
     oracle,
 )
 from neuroprior.planners import FrontierPlanner, frontier
-from neuroprior.worlds import cube, egocentric, maze
+from neuroprior.worlds import cube
 from tests.support.sources import random_world, seeded
 
 HOW = (
@@ -149,29 +147,3 @@ def test_other_states_than_numbers():
     sampled = SamplingPlanner(prior, 3, 300, **how).plan(world, state, seeded(1)).score
     assert (found == 1).all()
     assert sampled.mean() < 0.9
-
-
-def test_egocentric_mazes_are_nearly_solved():
-    """256 plans of 16 steps in mazes of 15 x 15: less than 2 % from the oracle, where samples lose 5 % or more."""
-    learn_in, world = (
-        egocentric(maze(15, 15, num_layouts=5, num_worlds=5, reward_power=8, seed=seed)) for seed in (1, 2)
-    )
-    prior = MarkovPrior(3, 3).fit(collect(ExhaustivePlanner(7), learn_in, 500, generator=seeded(0)))
-    state = world.reset(200, seeded(1))
-    best = oracle(world, state, 16).double().mean()
-    found = FrontierPlanner(prior, 16, 256).plan(world, state, seeded(2))
-    assert found.model_steps <= 16 * 256
-    assert found.score.double().mean() > 0.98 * best
-    sampled = SamplingPlanner(prior, 16, 256).plan(world, state, seeded(2))
-    assert sampled.score.double().mean() < 0.95 * best
-
-
-def test_of_plans_that_meet_the_one_with_the_higher_discounted_return_goes_on():
-    """Two ways to cell 3: 0 and then 1.2, or 1 and then 0; at a discount of one half the second is better."""
-    table = torch.tensor([[1, 2], [3, 3], [3, 3], [3, 3]])
-    reward = torch.tensor([[[0.0, 1.0], [1.2, 1.2], [0.0, 0.0], [0.0, 0.0]]])
-    for discount, best, first in ((0.5, 1.0, 1), (1.0, 1.2, 0)):
-        planner = FrontierPlanner(UniformPrior(2), 3, 20, objective="return", discount=discount)
-        decision = planner.plan(TabularWorld(table, reward), torch.zeros(5, dtype=torch.long), seeded(0))
-        assert decision.score.tolist() == pytest.approx([best] * 5)
-        assert decision.plan[:, 0].tolist() == [first] * 5

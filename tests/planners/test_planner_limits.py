@@ -10,7 +10,6 @@ from neuroprior import (
     SamplingPlanner,
     UniformPrior,
     World,
-    gridworld,
 )
 from neuroprior.agents import Agent
 from neuroprior.planners import FrontierPlanner, MCTSPlanner, execute
@@ -98,21 +97,6 @@ def test_a_plan_may_be_shorter_where_the_episode_ends_with_it():
         agent = Agent(world, planner, prior, state, replan_every=every, plan_length=6, learn_every=None)
         solved = world.solved(agent.run(6).states.flatten(0, 1)).view(40, 6)
         assert solved.any(1)[lengths > 0].all()
-
-
-def test_chunks_are_put_together_with_lengths() -> None:
-    world = gridworld(5, 5, num_worlds=2, seed=1)
-    state = torch.arange(50)
-    planner = ExhaustivePlanner(3, any_prefix=True)
-    whole = planner.plan(world, state, torch.Generator().manual_seed(0))
-    planner.steps_at_once = 400
-    parts = planner.plan(world, state, torch.Generator().manual_seed(0))
-    assert parts.score.equal(whole.score)
-    assert parts.lengths is not None
-    for b in range(50):
-        rollout = world.rollout(state[b : b + 1], parts.plan[b, : parts.lengths[b]][None, None])
-        assert int(rollout.final_state) == int(parts.final_state[b])
-        assert float(rollout.rewards[0, 0, -1]) == float(parts.score[b])
 
 
 @pytest.mark.parametrize("planner", [ExhaustivePlanner(2), SamplingPlanner(UniformPrior(2), 2, 8)])

@@ -80,17 +80,6 @@ def test_expected_scores_are_those_of_all_trajectories(kind, goal):
         assert torch.equal(expected_score(world, states, plans, **goal), whole)
 
 
-@pytest.mark.parametrize("goal", OBJECTIVES)
-@pytest.mark.parametrize("kind", ["S", "SA", "WS", "WSA"])
-def test_in_a_deterministic_world_the_expected_score_is_the_score(kind, goal):
-    world = random_world(3, kind, states=5)
-    states = world.reset(20, seeded(0))
-    plans = torch.randint(3, (20, 6, 4), generator=seeded(1))
-    rollout = world.rollout(states, plans)
-    want = ExhaustivePlanner(1, **goal).for_world(world).score(rollout.rewards, rollout.final_state)
-    torch.testing.assert_close(expected_score(world, states, plans, **goal), want)
-
-
 def test_a_cell_that_cannot_be_has_no_part_in_the_mean():
     world = TabularWorld(torch.tensor([[0], [0]]), torch.tensor([[[1.0], [-torch.inf]]]))
     assert expected_score(world, torch.tensor([0]), torch.zeros(1, 1, 2, dtype=torch.long)).tolist() == [[1.0]]

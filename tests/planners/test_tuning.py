@@ -32,19 +32,6 @@ def candidates(planner: SamplingPlanner, world: TabularWorld, starts: int = 20) 
     return planner.candidates(world, torch.zeros(starts, dtype=torch.long), seeded(0))[0]
 
 
-@pytest.mark.parametrize(("share", "number"), [(0.0, 0), (0.1, 2), (0.3, 6), (1.0, 20)])
-def test_so_many_candidates_are_uniform(share, number):
-    """A prior of ones: of P uniform plans of 8 moves, 2 ** -8 are all ones, in 20 starts at most 3 (p < 1e-3)."""
-    prior = MarkovPrior(2, 0, smoothing=1e-9, backoff="dirichlet").fit(torch.ones(500, 8, dtype=torch.long))
-    world = gridworld(5, 5)
-    world = TabularWorld(world.next_state[:, :2], torch.zeros(25))
-    plans = candidates(SamplingPlanner(prior, 8, 20, uniform_share=share), world)
-    assert plans.shape == (20, 20, 8)
-    assert bool((plans[:, : 20 - number] == 1).all())
-    assert int((plans[:, 20 - number :] == 1).all(-1).sum()) <= 3 * (number + 1)
-    assert float(plans[:, 20 - number :].float().mean()) == pytest.approx(0.5, abs=0.2) or not number
-
-
 def test_without_a_share_nothing_changes():
     world, prior = gridworld(6, 6), MarkovPrior(4, 1).fit(torch.randint(4, (50, 3), generator=seeded(0)))
     state = torch.arange(36)

@@ -7,7 +7,7 @@ import gymnasium
 import pytest
 import torch
 
-from neuroprior import from_gymnasium, oracle
+from neuroprior import from_gymnasium
 from neuroprior.testing import check_world
 from neuroprior.worlds import EpisodicWorld
 from tests.support.environments import Corridor
@@ -85,12 +85,6 @@ def test_starts():
     with_passenger = from_gymnasium("Taxi-v4", starts="any").starts
     # The taxi, the passenger in it or at one of three corners: not where he wants to go, where the episode ends.
     assert int((with_passenger > 0).sum()) == 25 * 4 * 4
-
-
-def test_the_best_walk_along_the_cliff_takes_thirteen_steps():
-    world = from_gymnasium("CliffWalking-v1")
-    start = world.reset(1)
-    assert [float(oracle(world, start, length, objective="return")) for length in (12, 13, 20)] == [-12, -13, -13]
 
 
 def test_an_end_that_is_also_passed_through_gets_a_state_of_its_own():

@@ -159,14 +159,6 @@ def test_who_follows_the_direction_is_at_the_goal(egocentric):
         goal_direction(gridworld(4, 4, edges="torus"))
 
 
-def test_a_view_turns_with_the_agent():
-    walls = torch.tensor([[[1, 1, 1], [1, 0, 0], [1, 1, 1]]]).bool()  # a dead end, open to the right
-    world = GridWorld(3, 3, "wall", torch.zeros(1, 9), walls=walls, egocentric=True, view=1)
-    observed = world.observe(torch.arange(16, 20))
-    # The eight squares around: ahead is number 1, to the left 3, to the right 4, behind 6.
-    assert observed.nonzero().tolist() == [[0, 4], [1, 1], [2, 3], [3, 6]]
-
-
 @pytest.mark.parametrize("turns", [False, True])
 def test_reset_is_uniform_over_the_squares_that_are_free(turns):
     world = GridWorld(4, 5, "wall", torch.zeros(2, 60), walls=WALLS, egocentric=turns)

@@ -92,15 +92,6 @@ def test_plans_of_a_start_have_common_random_numbers_and_starts_do_not():
     assert p_value(first[::2] * 10 + first[1::2], (share[:, None] * share).flatten()) > FALSE_ALARM
 
 
-def test_random_numbers_are_quantiles_that_all_plans_share():
-    """Two actions with the same outcomes, of which the second is 0.2 likelier to succeed: it never does worse."""
-    probability = torch.tensor([[[0.5, 0.5], [0.3, 0.7]]]).repeat(2, 1, 1)
-    world = TabularWorld(torch.tensor([[[0, 1]] * 2] * 2), torch.tensor([0.0, 1.0]), probability=probability)
-    rewards = world.rollout(torch.zeros(9000).long(), torch.tensor([[[0], [1]]]).repeat(9000, 1, 1), seeded(0)).rewards
-    both = (rewards[:, 0] * 2 + rewards[:, 1]).long().flatten()
-    assert p_value(both, torch.tensor([0.3, 0.2, 0.0, 0.5])) > FALSE_ALARM
-
-
 @pytest.mark.parametrize("num_plans", [0, 1, 50])
 def test_as_many_numbers_are_drawn_however_many_plans(num_plans):
     world, generator = stochastic_world(4), seeded(5)

@@ -138,21 +138,6 @@ def test_rollout_takes_stored_actions():
         assert torch.equal(got.rewards, want.rewards)
 
 
-@pytest.mark.parametrize("kind", ["WS", "WSA"])
-def test_maps_together_are_worlds_apart(kind):
-    world = random_world(2, kind, maps=4)
-    cell, number = torch.arange(24) % 6, torch.arange(24) // 6
-    plans = torch.randint(3, (24, 7, 5), generator=seeded(3))
-    together = world.rollout(world.state(cell, number), plans)
-    for w in range(4):
-        alone = TabularWorld(world.next_state, world.reward[w])
-        here = number == w
-        got = alone.rollout(cell[here], plans[here])
-        assert torch.equal(got.rewards, together.rewards[here])
-        assert torch.equal(got.final_state, world.cell(together.final_state[here]))
-        assert (world.reward_map(together.final_state[here]) == w).all()
-
-
 def test_state_and_its_parts():
     world = random_world(0, maps=3)
     cell, number = torch.tensor([0, 5, 2]), torch.tensor([2, 0, 1])

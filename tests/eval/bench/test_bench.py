@@ -24,7 +24,6 @@ from eval.bench.jobs import (
     source,
 )
 from neuroprior import GRUPrior, MarkovPrior, MCTSPlanner, TabularWorld, UniformPrior, gridworld
-from neuroprior.control import DoubleIntegrator
 from neuroprior.plans import all_plans
 from neuroprior.puzzles import AStarPlanner, sliding_tiles
 from neuroprior.worlds import maze
@@ -127,13 +126,6 @@ def test_a_star_in_python_solves_what_ours_does():
     assert [expanded for expanded, _ in peers.python_a_star(boards.flatten(1), 3, 1)()] == (want.lengths > 0).tolist()
 
 
-def test_a_plain_controller_moves_to_the_goal():
-    world = DoubleIntegrator()
-    plans = peers.plain_mppi(world, torch.tensor([[0.9, -0.9, 0, 0]]), 10, 500, 0.5)
-    assert plans.shape == (1, 10, 2)
-    assert float(plans[0, :, 0].mean()) < 0 < float(plans[0, :, 1].mean())
-
-
 def test_what_is_left_beside_busy_processes_is_a_table():
     own = {"job": "j", "about": "a", "peer": "p", "seconds": 1.0, "low": 1.0, "high": 9.0, "goal": 1.0}
     rows = [own | {"busy": number, "ratio": ratio} for number, ratio in ((0, 8.0), (2, 3.0))]
@@ -141,15 +133,6 @@ def test_what_is_left_beside_busy_processes_is_a_table():
     assert len(first.rows) == len(busy.rows) == 1
     assert busy.rows[0][1:] == ["8", "3", "0.38", "no"]
     assert len(tables({"peers": rows[:1]}, {"threads": 2, "scale": 1.0})) == 1
-
-
-@pytest.mark.slow
-def test_ratios_beside_busy_processes(capsys, tmp_path):
-    arguments = ["--parts", "peers", "--jobs", "sample_markov", "--scale", "0.001", "--repetitions", "1"]
-    assert main(["bench", *arguments, "--busy", "0", "1", "--out", str(tmp_path)]) == 0
-    rows = pd.read_csv(tmp_path / "peers.csv")
-    assert sorted(rows.busy.unique()) == [0, 1]
-    assert "busy processes" in capsys.readouterr().out
 
 
 def test_the_quickest_training_that_is_close_enough_is_timed():
@@ -190,15 +173,6 @@ def test_gymnasium_takes_the_plans(make):
         found = list(run())
         assert found[0] > 0.9
         assert found[1] == 0
-
-
-@pytest.mark.slow
-def test_mctx_finds_the_actions_that_pay():
-    """A reward for action 2 alone, and more for whoever goes on with it."""
-    pytest.importorskip("mctx")
-    world = TabularWorld(torch.tensor([[0, 0, 1, 0], [1, 1, 1, 1]]), torch.tensor([[0.0, 1.0]]))
-    action = peers.mctx_search(world, torch.zeros(20, dtype=torch.long), UniformPrior(4), 64, 4)()
-    assert np.asarray(action).tolist().count(2) >= 15
 
 
 @pytest.mark.parametrize("prior", [UniformPrior(4), source(), GRUPrior(4, 8, lags=1)], ids=lambda p: type(p).__name__)

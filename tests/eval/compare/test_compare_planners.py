@@ -85,18 +85,6 @@ def test_differences_are_paired_by_seed():
     assert second["p_holm"] == 1
 
 
-def test_tables_of_a_world():
-    document = planner_document(list(results(0.2)), {}, "")
-    scores, differences = document.sections[1].tables
-    assert [row[:3] for row in scores.rows] == [["gru", "initial", "sampling"], ["gru", "initial", "mcts"]]
-    assert scores.rows[1][3].startswith("81.5 ±")
-    assert scores.rows[1][3].endswith("*") == bool(document.frames["paired"]["p_holm"][0] < 0.05)
-    assert differences.title == "maze, 16 plans: differences to sampling"
-    assert differences.rows == [["gru", "initial", "mcts", "+0.0", "+0.0 to +0.0", "1.000"]]
-    assert document.lead.startswith("Normalised scores against sampling: 1 of 2 differences are significant")
-    assert document.lead.endswith("1 positive, 0 negative.")
-
-
 def test_a_single_seed_has_no_interval():
     document = planner_document(list(results(0.2, seeds=1)), {}, "")
     assert document.frames["paired"].empty

@@ -57,22 +57,6 @@ def test_deep_horizons_count():
     assert HorizonPlanner(UniformPrior(4), 64, 16)._best_horizon(found, 640).tolist() == [42]  # 15 plans, as of 41
 
 
-def test_ties_over_rounds():
-    """All eight plans of a binary tree of three steps are worth the same: chi-square over 8,000 decisions.
-
-    One step is worth nothing, so that nothing is to be expected of it; the last one is all that counts.
-    """
-    table = torch.arange(30).view(15, 2).add(1).clamp(max=15)
-    table = torch.cat([table, torch.full((1, 2), 15)])
-    reward = torch.zeros(16)
-    reward[7:15] = 1
-    state = torch.zeros(8000, dtype=torch.long)
-    decision = HorizonPlanner(UniformPrior(2), 3, 12).plan(TabularWorld(table, reward), state, seeded(0))
-    assert (decision.lengths == 3).all()
-    number = (decision.plan.long() * torch.tensor([4, 2, 1])).sum(1)
-    assert p_value(number, torch.ones(8)) > FALSE_ALARM
-
-
 class Turns:
     """A prior that takes action 0 throughout its first plans, action 1 throughout the next ones, and so on."""
 

@@ -116,11 +116,8 @@ def test_what_is_reported():
     )
     due = paired_difference(own, other)
     assert (gap["difference"], gap["low"], gap["p_value"]) == pytest.approx((due.mean, due.low, due.p_value))
-    eaten, differences = document.sections[1].tables
+    eaten, _ = document.sections[1].tables
     assert [row[3].endswith("*") for row in eaten.rows] == [False, False, False, True, False, True, False, False]
-    found = {tuple(row[:4]): row[4:] for row in differences.rows}
-    assert re.match(r"\+(9\.9|10\.)", found["markov", "none", "online", "random"][0])
-    assert float(found["uniform", "none", "never", "no warm start"][-1]) > 0.05
     significant, tests = sum(gap["p_holm"] < 0.05 for gap in gaps), len(gaps)
     assert f"{significant} of {tests} differences are significant" in document.lead
 

@@ -13,11 +13,10 @@ from eval.options.planner import OptionPlanner
 from eval.options.priors import entrants, pairs
 from eval.options.report import compared_pairs
 from eval.options.run import OptionSettings, index_of, numbered, observed, scores_reached
-from eval.worlds.labyrinth import DATA, cut_plans
 from eval.worlds.runs import Run
 from eval.worlds.starts import Starts
 from eval.worlds.suite import Task
-from neuroprior import ExhaustivePlanner, Plans, SamplingPlanner, TabularWorld, UniformPrior, collect, read_plans
+from neuroprior import ExhaustivePlanner, Plans, SamplingPlanner, TabularWorld, UniformPrior, collect
 from neuroprior.behaviour.analysis.comparison import score
 from neuroprior.priors import SwitchingPrior
 from neuroprior.worlds import four_rooms
@@ -149,14 +148,6 @@ def test_scores_are_the_best_of_blocks():
     shares = scores_reached(planner, starts, (1, 2, 4), seeded(0))
     # By Hoeffding 4,000 starts miss their mean by 0.05 with probability 2 exp(-20).
     assert shares == pytest.approx([0.5, 0.75, 0.9375], abs=0.05)
-
-
-def test_pieces_of_the_mice_are_consecutive():
-    plans = read_plans(DATA)
-    pieces = cut_plans(plans, 64)
-    assert pieces.actions.shape == (7 * len(plans), 64)
-    assert pieces.actions[:7].flatten().equal(plans.actions[0, :448])
-    assert pieces.context[7:14].flatten().equal(plans.context[1, :448])
 
 
 def test_only_priors_with_the_same_context_are_paired():

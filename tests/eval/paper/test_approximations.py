@@ -78,17 +78,6 @@ def test_networks_learn_independently_and_again(peak):
     torch.testing.assert_close(scaled[1], 100 * first[1] + 7, rtol=1e-4, atol=1e-4)
 
 
-def test_approximations_keep_shape_and_dtype(peak):
-    values, coordinates = peak
-    for dtype in (torch.float32, torch.float64):
-        for approximation in (
-            tile_approximation(values.to(dtype), coordinates, 4),
-            network_approximation(values.to(dtype), coordinates, steps=1, generator=seeded(0)),
-        ):
-            assert approximation.shape == (1, 120)
-            assert approximation.dtype == dtype
-
-
 def test_constant_values_and_coordinates_are_fitted():
     coordinates = torch.tensor([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]])
     for approximation in (

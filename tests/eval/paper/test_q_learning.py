@@ -21,13 +21,6 @@ def test_q_learning_with_exploration_comes_to_the_true_values(edges):
     torch.testing.assert_close(learned, after.expand(4, -1, -1), atol=1e-9, rtol=0)
 
 
-def test_some_exploration_and_half_steps_come_there_too():
-    world = gridworld(3, 4, "wall")
-    learned = q_learning(world, 5, num_agents=3, steps=4000, epsilon=0.5, discount=0.8, generator=seeded(1))
-    true = value_iteration(world, goal=5, discount=0.8)
-    torch.testing.assert_close(learned.amax(-1), true.expand(3, -1), atol=1e-3, rtol=0)
-
-
 def test_greedy_learning_is_cut_short():
     world = gridworld(10, 10)
     true = value_iteration(world, goal=55)
