@@ -149,3 +149,9 @@ def test_curriculum_writes_curves(tmp_path):
         == 0
     )
     assert results(tmp_path / "own")["settings"]["rounds"] == curriculum.ROUNDS
+
+
+@pytest.mark.parametrize("name", ["worlds", "num_plans", "kinds"])
+def test_empty_lists_are_refused(name, tmp_path):
+    with pytest.raises(ValueError, match=f"`{name}` must have at least one"):
+        command.compare(out=str(tmp_path), **{name: []})

@@ -106,6 +106,12 @@ def test_actions_are_known_by_name(suffix, tmp_path):
     assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), new), abs=1e-6)
 
 
+def test_other_names_are_one_line(tmp_path, capsys):
+    folder = saved(MarkovPrior(3, 2), some_plans(action_names=NAMES), tmp_path / "prior")
+    write_plans(some_plans(action_names=("left", "on", "up")), tmp_path / "new.csv")
+    fails(capsys, tmp_path / "new.csv", [folder], tmp_path / "out", "up", "left, on, right")
+
+
 def test_priors_of_other_names_are_one_line(tmp_path, capsys):
     learned = some_plans(action_names=NAMES)
     folders = [saved(MarkovPrior(3, 2), learned, tmp_path / "a")]

@@ -36,6 +36,7 @@ def test_the_table_does_what_the_environment_does(name):
     env.action_space.seed(0)
     state, ends = env.reset(seed=0)[0], 0
     for _ in range(5000):
+        assert world.state_of(env).tolist() == [state]
         action = int(env.action_space.sample())
         observed, reward, terminated, _, _ = env.step(action)
         after, gained = world.step(torch.tensor([state]), torch.tensor([action]))

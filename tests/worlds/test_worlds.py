@@ -240,6 +240,11 @@ def test_rollout_names_the_state_that_is_out_of_range(where, state):
         random_world(0).rollout(states, torch.zeros(3, 1, 1, dtype=torch.long))
 
 
+def test_states_of_another_shape_are_named():
+    with refuses("state", "[3, 1]"):
+        random_world(0).rollout(torch.zeros(3, 1).long(), torch.zeros(3, 1, 1).long())
+
+
 @pytest.mark.parametrize(("cell", "number", "word"), [(6, 0, "cell"), (-1, 0, "cell"), (0, 2, "reward_map")])
 def test_state_refuses(cell, number, word):
     with refuses(word):

@@ -24,6 +24,7 @@ from eval.bench.jobs import (
     source,
 )
 from neuroprior import GRUPrior, MarkovPrior, MCTSPlanner, TabularWorld, UniformPrior, gridworld
+from neuroprior.control import DoubleIntegrator
 from neuroprior.plans import all_plans
 from neuroprior.puzzles import AStarPlanner, sliding_tiles
 from neuroprior.worlds import maze
@@ -124,6 +125,13 @@ def test_a_star_in_python_solves_what_ours_does():
     want = AStarPlanner(world.lower_bound, max_nodes=5000).search(world, boards)
     assert [steps for _, steps in peers.python_a_star(boards.flatten(1), 3, 5000)()] == want.lengths.tolist()
     assert [expanded for expanded, _ in peers.python_a_star(boards.flatten(1), 3, 1)()] == (want.lengths > 0).tolist()
+
+
+def test_a_plain_controller_moves_to_the_goal():
+    world = DoubleIntegrator()
+    plans = peers.plain_mppi(world, torch.tensor([[0.9, -0.9, 0, 0]]), 10, 500, 0.5)
+    assert plans.shape == (1, 10, 2)
+    assert float(plans[0, :, 0].mean()) < 0 < float(plans[0, :, 1].mean())
 
 
 def test_what_is_left_beside_busy_processes_is_a_table():

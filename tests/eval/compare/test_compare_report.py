@@ -158,6 +158,7 @@ def test_plans_are_drawn_in_their_world():
     "make",
     [
         lambda: figures.score_figure(pd.DataFrame(), [], {}),
+        lambda: figures.score_panels([]),
         lambda: figures.curriculum_figure(pd.DataFrame(), [], {}),
         lambda: figures.gap_figure(pd.DataFrame(), ("a", "b")),
         lambda: figures.dots_figure(pd.DataFrame(), {}, "x"),
