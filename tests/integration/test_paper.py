@@ -65,7 +65,11 @@ def test_paper_writes_tables_and_figures(small_run: Path) -> None:
     assert [path.name for path in small_run.glob(".*")] == [".neuroprior.json"]
 
 
-def test_all_protocols_and_one_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_all_protocols_and_one_world(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Shown in 80 columns."""
+    monkeypatch.setenv("COLUMNS", "80")
     assert main(["paper", *SMALL, "--worlds", "1", "--protocols", "all", "--out", str(tmp_path)]) == 0
     results = json.loads((tmp_path / "results.json").read_text())
     assert len(results["protocols"]) == 8
@@ -73,7 +77,10 @@ def test_all_protocols_and_one_world(tmp_path: Path, capsys: pytest.CaptureFixtu
     nearest = results["protocols"][distances.index(min(distances))]
     assert all(nearest[key] == value for key, value in results["nearest"]["table"].items())
     assert [(row["edges"], row["initial_scale"]) for row in results["scales"]][:2] == [("torus", 1e-4), ("torus", 0.01)]
-    assert "nearest to the paper's matrix" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "nearest to the paper's matrix" in shown
+    assert "…" not in shown
+    assert max(map(len, shown.splitlines())) <= 80
 
 
 @pytest.mark.parametrize("edges", ["torus", "wall"])
@@ -104,14 +111,6 @@ def test_unwritable_folder_is_one_line(tmp_path: Path, capsys: pytest.CaptureFix
     (tmp_path / "file").write_text("")
     assert main(["paper", *SMALL, "--out", str(tmp_path / "file" / "below")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
-
-
-def test_tables_fit_80_columns(small_run: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    assert main(["paper", *SMALL, "--protocols=all", "--out", str(tmp_path)]) == 0
-    shown = capsys.readouterr().out
-    assert "…" not in shown
-    assert max(map(len, shown.splitlines())) <= 80
 
 
 def test_an_interrupted_command_is_one_line(

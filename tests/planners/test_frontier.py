@@ -147,3 +147,14 @@ def test_other_states_than_numbers():
     sampled = SamplingPlanner(prior, 3, 300, **how).plan(world, state, seeded(1)).score
     assert (found == 1).all()
     assert sampled.mean() < 0.9
+
+
+def test_of_plans_that_meet_the_one_with_the_higher_discounted_return_goes_on():
+    """Two ways to cell 3: 0 and then 1.2, or 1 and then 0; at a discount of one half the second is better."""
+    table = torch.tensor([[1, 2], [3, 3], [3, 3], [3, 3]])
+    reward = torch.tensor([[[0.0, 1.0], [1.2, 1.2], [0.0, 0.0], [0.0, 0.0]]])
+    for discount, best, first in ((0.5, 1.0, 1), (1.0, 1.2, 0)):
+        planner = FrontierPlanner(UniformPrior(2), 3, 20, objective="return", discount=discount)
+        decision = planner.plan(TabularWorld(table, reward), torch.zeros(5, dtype=torch.long), seeded(0))
+        assert decision.score.tolist() == pytest.approx([best] * 5)
+        assert decision.plan[:, 0].tolist() == [first] * 5

@@ -41,12 +41,6 @@ def test_a_goal_that_cannot_be_reached_is_worth_nothing():
     assert value_iteration(world, goal=1, discount=0.5).tolist() == [[1.0, 2.0, 0.0]]
 
 
-def test_rewards_on_arrival_by_hand():
-    # Reward 1 in the last cell, for ever: 1 / (1 - 1/2) = 2 beside it and in it, and half as much a step further.
-    values = value_iteration(corridor([0.0, 0.0, 0.0, 1.0]), discount=0.5)
-    torch.testing.assert_close(values, torch.tensor([[0.5, 1.0, 2.0, 2.0]]).double(), atol=1e-8, rtol=0)
-
-
 def test_rewards_of_actions_by_hand():
     reward = torch.zeros(4, 2)
     reward[0, 0] = 1.0  # bumping into the left wall
