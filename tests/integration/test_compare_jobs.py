@@ -1,4 +1,4 @@
-"""The runs of a comparison: kept, resumed after an interruption or a killed process, and shared out over processes."""
+"""The runs of a comparison: what goes to other processes, what makes another folder, and files that are damaged."""
 
 from dataclasses import replace
 from functools import partial

@@ -1,4 +1,4 @@
-"""Successive halving: no more rollouts than without it, and better plans for them."""
+"""Successive halving: no more rollouts than without it, and more of them for the better plans."""
 
 import itertools
 

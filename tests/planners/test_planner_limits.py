@@ -1,4 +1,4 @@
-"""Planners at their limits: chunks of starts, rewards that are not numbers, states of a wrong dtype."""
+"""Planners at their limits: states without legal actions, plans that end early, rewards that are not numbers."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Planners against brute force over all plans, ties, chunks, the oracle, and what is collected."""
+"""Planners against brute force over all plans, chunks, the oracle, and what is collected."""
 
 import pytest
 import torch

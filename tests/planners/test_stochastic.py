@@ -1,4 +1,4 @@
-"""Planners in stochastic worlds: exact means against enumerated trajectories, means over rollouts, ties, refusals."""
+"""Planners in stochastic worlds: exact means against enumerated trajectories, means over rollouts, ties."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""The 2 x 2 x 2 cube against a cube of stickers, known identities and the known numbers of states at each distance."""
+"""The 2 x 2 x 2 cube against a cube of stickers and the known numbers of states at each distance."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""`python -m eval curriculum`: gains that are known, views of rounds and lengths, figures; options in one line."""
+"""`python -m eval curriculum`: gains that are known, views of rounds and lengths, figures."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""`python -m eval quality` and `python -m eval plans`: sources of known entropy, and saved priors on a file."""
+"""`python -m eval quality`: sources of known entropy, text, and long sequences."""
 
 import itertools
 import json
