@@ -20,7 +20,7 @@ from neuroprior.priors import MarkovPrior, load, save
 from neuroprior.testing import check_prior
 from tests.support.saved import content_of, rewrite
 from tests.support.sources import seeded
-from tests.support.vectors import Drift
+from tests.support.vectors import Drift, walks
 
 LOW, HIGH = [-1.0, -2.0], [1.0, 3.0]
 KINDS = {
@@ -316,16 +316,6 @@ def test_shorter_plans_are_learned_from():
     forecast, _ = prior.start(1)
     assert float(forecast.mean) == pytest.approx(float(all_of_them.mean()))
     assert float(forecast.std) == pytest.approx(float(all_of_them.std(correction=0)), rel=1e-4)
-
-
-def walks(num_plans: int, length: int, size: int, seed: int) -> VectorPlans:
-    """Stationary autoregressions of order 1, of standard deviation .15."""
-    noise = torch.randn(length + 50, num_plans, size, generator=seeded(seed))
-    values = [torch.zeros(num_plans, size)]
-    for now in noise:
-        values.append(0.95 * values[-1] + (1 - 0.95**2) ** 0.5 * now)
-    bounds = [[side] * size for side in (-1.0, 1.0)]
-    return VectorPlans((0.15 * torch.stack(values[-length:], 1)).clamp(-1, 1), *bounds)
 
 
 @pytest.mark.parametrize("lengths", [[12], [40], [40, 1, 1, 2, 1]])
