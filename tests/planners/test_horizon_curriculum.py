@@ -109,6 +109,18 @@ def test_neural_priors_see_what_their_plans_recorded(per):
     assert shape == (None if per is None else (30, 6))
 
 
+def test_same_seed_same_plans():
+    def extended(seed: int) -> torch.Tensor:
+        world, generator = gridworld(6, 6), seeded(seed)
+        plans = collect(ExhaustivePlanner(2), world, 40, generator=generator)
+        how = {"num_starts": 20, "num_plans": 8, "generator": generator, "max_steps": 2, "progress": False}
+        *_, last = extend_horizon(GRUPrior(4, 8), plans, world, (4, 5), **how)
+        return last.plans.actions
+
+    assert torch.equal(extended(3), extended(3))
+    assert not torch.equal(extended(3), extended(4))
+
+
 def test_only_plans_that_led_somewhere():
     """A goal is seldom in reach of three moves; those that found it end in it."""
     world = four_rooms(7, 7, reward="goal", num_worlds=4, num_layouts=3)

@@ -26,6 +26,7 @@ from tests.support.sources import (
     plan_number,
     random_world,
     seeded,
+    stochastic_world,
 )
 
 VALUES = torch.rand(12, generator=seeded(99)) * 2 - 1
@@ -144,6 +145,19 @@ def test_chunks(make, steps, monkeypatch):
     assert torch.equal(got.rewards[:, 0, -1], decision.score)
     assert torch.equal(got.final_state[:, 0], decision.final_state)
     assert decision.model_steps == (39 if isinstance(planner, ExhaustivePlanner) else 1000)
+
+
+@pytest.mark.parametrize("world", [random_world(1), stochastic_world(8)], ids=["sure", "stochastic"])
+def test_what_is_collected_depends_on_the_generator_alone(world):
+    planner, drawn = SamplingPlanner(MarkovPrior(3), 3, 20), []
+    for seed in (3, 3, 4):
+        torch.manual_seed(len(drawn))
+        before = torch.get_rng_state()
+        drawn.append(collect(planner, world, 200, generator=seeded(seed), context="step"))
+        assert torch.equal(before, torch.get_rng_state())
+    assert torch.equal(drawn[0].actions, drawn[1].actions)
+    assert torch.equal(drawn[0].context, drawn[1].context)
+    assert not torch.equal(drawn[0].context, drawn[2].context)
 
 
 @pytest.mark.parametrize("bad", [-torch.inf, -1e30])

@@ -228,6 +228,19 @@ def test_a_run_holds_every_prior_before_and_after_the_curriculum(run):
     assert torch.tensor(run["plans"]["paths"]["gru"]).shape == (12, 6, 2)
 
 
+def test_the_same_seed_gives_the_same_results(run):
+    def results(found: dict) -> str:
+        kept = {key: value for key, value in found.items() if key not in ("seconds", "entries")}
+        entries = [{key: value for key, value in one.items() if key != "seconds"} for one in found["entries"]]
+        return json.dumps(kept | {"entries": entries})
+
+    assert results(run_in(TINY, 0, SMALL)) == results(run)
+    other = run_in(TINY, 1, replace(SMALL, kinds=(), context=("none",)))
+    for found, same in zip(other["entries"], run["entries"], strict=False):  # what needs no training
+        assert found["prior"] == same["prior"]
+        assert found["share"] != same["share"]
+
+
 def test_a_world_decides_contexts_and_the_number_of_training_starts(monkeypatch):
     asked = []
     monkeypatch.setattr(run_module, "collect", lambda *given, **how: asked.append(given[2]) or collect(*given, **how))
