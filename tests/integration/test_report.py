@@ -183,6 +183,14 @@ def test_contexts_are_known_by_name(make, kind, tmp_path):
     assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), new), abs=1e-6)
 
 
+def test_contexts_without_names_are_numbers(tmp_path):
+    learned, new = in_contexts(), replace(in_contexts(40, 9), context_names=None)
+    folder = saved(MarkovPrior(3, 1, num_contexts=3), learned, tmp_path / "prior")
+    write_plans(new, tmp_path / "new.csv")
+    rows = evaluate(tmp_path / "new.csv", [folder])
+    assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), new), abs=1e-6)
+
+
 def test_a_context_that_is_missing_is_one_line(tmp_path, capsys):
     folder = saved(MarkovPrior(3, 1, num_contexts=3), in_contexts(), tmp_path / "prior")
     write_plans(some_plans(), tmp_path / "new.npz")
