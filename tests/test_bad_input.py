@@ -165,6 +165,7 @@ def test_numbers_of_numpy_are_numbers():
         (["fit", "FILE", "--prior", "mixture", "--effort=full"], ["`effort` must be left out", "got full"]),
         (["sample", "PRIOR", "--seed", str(2**70)], ["seed", "2**63"]),
         (["score", "PRIOR", "FILE", "--out", "OUT"], ["at least two held-out actions"]),
+        (["example", "."], ["ends in .csv"]),
     ],
 )
 def test_options_that_cannot_be(arguments, words, tmp_path, capsys):

@@ -1,6 +1,5 @@
 """Replay: what is remembered is forgotten with the probability that it should."""
 
-import pytest
 import torch
 from scipy import stats
 
@@ -36,12 +35,6 @@ def test_nothing_is_forgotten_where_all_is_kept():
         replay.forget(seeded(0))
     assert replay.plans.actions[:, 0].tolist() == replay.plans.context[:, 0].tolist() == list(range(12))
     assert set(replay.tensors()) == {"actions", "context"}
-
-
-@pytest.mark.parametrize("retention", [0, -1, 1.5, float("nan")])
-def test_bad_retention(retention):
-    with refuses("retention"):
-        Replay(retention)
 
 
 def test_what_does_not_fit_is_refused():

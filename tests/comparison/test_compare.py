@@ -11,12 +11,12 @@ import torch
 import neuroprior
 from neuroprior import GRUPrior, MarkovPrior, SamplingPlanner, TabularWorld, World, compare, gridworld, load, save
 from neuroprior.comparison import Row, experiment
-from neuroprior.comparison.contestants import fit_markov, fit_prior, learns, make_planner, name_priors
+from neuroprior.comparison.contestants import fit_markov, fit_prior, learns, make_planner
 from neuroprior.comparison.trial import Design, draw_starts, run_seed, training_plans, true_scores
 from neuroprior.planners import Decision, Planner
 from neuroprior.worlds import Categories, EpisodicWorld, from_simulator
 from tests.support import simulators
-from tests.support.sources import refuses
+from tests.support.sources import refuses, seeded
 
 LENGTH = 4
 """Actions on the only path to the goal of `path_world`."""
@@ -47,14 +47,10 @@ class Fixed:
         return self.logits.expand(len(action), -1), state
 
 
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
 def test_scores_are_those_of_the_closed_form():
     """One of 16 plans reaches the goal. 240 decisions at 5 standard errors: a false alarm in 2 million."""
     priors = {"perfect": Fixed(0.0, 60.0)}
-    comparison = compare(path_world(), priors, ["sampling"], [4, 16], **QUICK, generator=seeded())
+    comparison = compare(path_world(), priors, ["sampling"], [4, 16], **QUICK, generator=seeded(0))
     q = 1 / 2**LENGTH
     for row in comparison.rows:
         p = 1.0 if row.prior == "perfect" else 1 - (1 - q) ** row.budget
@@ -66,14 +62,6 @@ def test_scores_are_those_of_the_closed_form():
         assert row.prior == "uniform" or row.score == pytest.approx(1.0)
     assert [row.p < 0.01 for row in comparison.rows if row.prior == "perfect"] == [True, True]
     assert comparison.scale == "the optimum"
-
-
-def test_a_prior_like_uniform_plans_differs_by_noise():
-    """Its p-value is uniform on [0, 1]: below .001 in one of 1,000 seeds."""
-    comparison = compare(path_world(), [Fixed(0.0, 0.0)], ["sampling"], [8], **QUICK, generator=seeded())
-    row = comparison.rows[1]
-    assert row.difference_low < 0 < row.difference_high or row.difference == 0
-    assert row.p > 0.001
 
 
 class Noisy(World):
@@ -93,10 +81,10 @@ def test_what_the_best_of_many_got_by_luck_is_no_score_in_a_noisy_world():
     world = Noisy()
     planner = SamplingPlanner(neuroprior.UniformPrior(3), 4, 256)
     planner.keep_candidates = True
-    decision = planner.plan(world, world.reset(160), seeded())
+    decision = planner.plan(world, world.reset(160), seeded(0))
     assert decision.candidates.scores.amax(1).mean() > 3
     assert abs(decision.score.mean()) < 1.2
-    comparison = compare(world, ["uniform"], ["sampling"], [256], **QUICK | {"seeds": 4}, generator=seeded())
+    comparison = compare(world, ["uniform"], ["sampling"], [256], **QUICK | {"seeds": 4}, generator=seeded(0))
     assert abs(comparison.rows[0].mean_score) < 1.2
     assert comparison.scale == "the best score found"
 
@@ -124,7 +112,7 @@ class Boastful(Planner):
 
 
 def test_planners_are_scored_by_what_they_reach_within_their_budget():
-    comparison = compare(path_world(), ["uniform"], [Boastful], [2], **QUICK, generator=seeded())
+    comparison = compare(path_world(), ["uniform"], [Boastful], [2], **QUICK, generator=seeded(0))
     assert comparison.rows[0].mean_score == 0
     assert comparison.rows[0].planner == "Boastful"
     with refuses("`planners` must take at most 8 simulator steps", "got 9 of greedy"):
@@ -166,7 +154,7 @@ class Fork(Line):
 
 def test_more_seeds_keep_the_first():
     first, more = (
-        compare(Line(), ["markov"], ["sampling"], [2], **QUICK | {"seeds": seeds}, generator=seeded())
+        compare(Line(), ["markov"], ["sampling"], [2], **QUICK | {"seeds": seeds}, generator=seeded(0))
         for seeds in (2, 3)
     )
     assert np.array_equal(first.outcomes[1].scores, more.outcomes[1].scores)
@@ -174,29 +162,16 @@ def test_more_seeds_keep_the_first():
 
 
 def test_a_frame_has_a_row_for_each_contestant():
-    comparison = compare(Line(), ["markov"], ["sampling", "mcts"], [2, 4], **QUICK, generator=seeded())
+    comparison = compare(Line(), ["markov"], ["sampling", "mcts"], [2, 4], **QUICK, generator=seeded(0))
     frame = comparison.frame()
     assert list(frame.columns) == list(Row._fields)
     assert len(frame) == 2 * 2 * 2
-    named = [
-        "planner",
-        "prior",
-        "budget",
-        "score",
-        "low",
-        "high",
-        "difference",
-        "difference_low",
-        "difference_high",
-        "p",
-    ]
-    assert set(named) <= set(frame.columns)
     assert frame[frame["prior"] == "uniform"]["p"].isna().all()
     assert (frame[frame["prior"] != "uniform"]["p_holm"] >= frame[frame["prior"] != "uniform"]["p"]).all()
 
 
 def test_time_limits_the_seeds_and_the_first_is_always_finished():
-    comparison = compare(path_world(), ["markov"], ["sampling"], [2], **QUICK | {"seconds": 1e-9}, generator=seeded())
+    comparison = compare(path_world(), ["markov"], ["sampling"], [2], **QUICK | {"seconds": 1e-9}, generator=seeded(0))
     assert len(comparison.outcomes) == 1
     assert any(note.startswith("Time for 1 of 6 seeds") for note in comparison.notes)
     assert "how much a prior varies" in str(comparison)
@@ -215,22 +190,22 @@ def test_an_interrupt_returns_the_finished_seeds(monkeypatch):
 
     monkeypatch.setattr(experiment, "run_seed", interrupted)
     stop = 3
-    comparison = compare(path_world(), ["markov"], ["sampling"], [2], **QUICK, jobs=1, generator=seeded())
+    comparison = compare(path_world(), ["markov"], ["sampling"], [2], **QUICK, jobs=1, generator=seeded(0))
     assert len(comparison.outcomes) == 2
     assert "Interrupted after 2 of 6 seeds." in comparison.notes
     begun.clear()
     stop = 1
     with pytest.raises(KeyboardInterrupt):
-        compare(path_world(), ["markov"], ["sampling"], [2], **QUICK, jobs=1, generator=seeded())
+        compare(path_world(), ["markov"], ["sampling"], [2], **QUICK, jobs=1, generator=seeded(0))
 
 
 def test_progress_goes_to_standard_error_at_once(capsys):
-    compare(path_world(), ["markov"], ["sampling"], [2], **QUICK | {"progress": True, "seeds": 2}, generator=seeded())
+    compare(path_world(), ["markov"], ["sampling"], [2], **QUICK | {"progress": True, "seeds": 2}, generator=seeded(0))
     out, err = capsys.readouterr()
     assert out == ""
     assert err.splitlines()[0].startswith("compare: priors uniform, markov; planners sampling")
     assert "2 of 2 seeds" in err
-    compare(path_world(), ["markov"], ["sampling"], [2], **QUICK, generator=seeded())
+    compare(path_world(), ["markov"], ["sampling"], [2], **QUICK, generator=seeded(0))
     assert capsys.readouterr().err == ""
 
 
@@ -243,9 +218,9 @@ def test_priors_that_have_learned_are_compared_as_they_are(tmp_path):
     assert learns(GRUPrior)
     assert learns("markov")
     assert not learns("uniform")
-    assert fit_prior(saved, None, 2, seeded()) is saved
+    assert fit_prior(saved, None, 2, seeded(0)) is saved
     priors = {"saved": saved, "untaught": untaught, "function": lambda actions: MarkovPrior(actions, 0)}
-    comparison = compare(path_world(), priors, ["sampling"], [64], **QUICK, generator=seeded())
+    comparison = compare(path_world(), priors, ["sampling"], [64], **QUICK, generator=seeded(0))
     assert comparison.priors == ("uniform", "saved", "untaught", "function")
     assert all(row.mean_score > 0.95 for row in comparison.rows)
     assert not untaught.has_learned
@@ -253,20 +228,20 @@ def test_priors_that_have_learned_are_compared_as_they_are(tmp_path):
 
 def test_the_order_of_a_markov_prior_is_chosen():
     """Plans that alternate need order 1; independent actions need none. Of 400 plans the choice is certain enough."""
-    first = torch.randint(2, (400, 1), generator=seeded())
+    first = torch.randint(2, (400, 1), generator=seeded(0))
     alternating = (first + torch.arange(6)) % 2
-    assert fit_markov(neuroprior.Plans(alternating, 2), seeded()).order >= 1
-    independent = torch.multinomial(torch.tensor([0.8, 0.2]), 2400, True, generator=seeded()).view(400, 6)
-    assert fit_markov(neuroprior.Plans(independent, 2), seeded()).order == 0
+    assert fit_markov(neuroprior.Plans(alternating, 2), seeded(0)).order >= 1
+    independent = torch.multinomial(torch.tensor([0.8, 0.2]), 2400, True, generator=seeded(0)).view(400, 6)
+    assert fit_markov(neuroprior.Plans(independent, 2), seeded(0)).order == 0
 
 
 def test_starts_are_held_out():
     design = Design(gridworld(6, 6, seed=0), None, {}, {}, (1,), 3, 10, 60, 16)
-    training, held_out, same = draw_starts(design, seeded())
+    training, held_out, same = draw_starts(design, seeded(0))
     assert (len(training), len(held_out), same) == (60, 10, False)
     assert not set(training.tolist()) & set(held_out.tolist())
     design = Design(path_world(), None, {}, {}, (1,), 3, 10, 60, 16)
-    training, held_out, same = draw_starts(design, seeded())
+    training, held_out, same = draw_starts(design, seeded(0))
     assert training.tolist() == [0] * 60
     assert held_out.tolist() == [0] * 10
     assert same
@@ -275,14 +250,14 @@ def test_starts_are_held_out():
 def test_only_plans_better_than_random_are_learned_from():
     """A single plan from each start reaches the goal from one in 16 of 600: 37, with a standard deviation of 6."""
     design = Design(path_world(), None, {}, {}, (1,), LENGTH, 10, 600, 1)
-    plans = training_plans(design, torch.zeros(600, dtype=torch.long), seeded())
+    plans = training_plans(design, torch.zeros(600, dtype=torch.long), seeded(0))
     assert plans is not None
     assert 20 <= len(plans) < 67
     assert (plans.actions == 1).all()
-    assert training_plans(design, torch.zeros(19, dtype=torch.long), seeded()) is None
+    assert training_plans(design, torch.zeros(19, dtype=torch.long), seeded(0)) is None
     barren = gridworld(4, 4, seed=0)
     barren.reward.zero_()
-    comparison = compare(barren, ["markov"], ["sampling"], [2], **QUICK, generator=seeded())
+    comparison = compare(barren, ["markov"], ["sampling"], [2], **QUICK, generator=seeded(0))
     assert comparison.summary().startswith("Nothing to compare")
     assert any("Priors learned nothing: fewer than 20 of 40" in note for note in comparison.notes)
     assert comparison.frame()["score"].isna().all()
@@ -298,24 +273,24 @@ def test_observations_are_contexts_only_if_the_world_declares_them():
     world.objective, world.observation = "return", None
     design = Design(world, None, {}, {}, (1,), 6, 10, 60, 64)
     state = torch.zeros(60, dtype=torch.long)
-    blind = training_plans(design, state, seeded())
+    blind = training_plans(design, state, seeded(0))
     assert blind is not None
     assert blind.context is None
     world.observation = Categories(8)
-    plans = training_plans(design, state, seeded())
+    plans = training_plans(design, state, seeded(0))
     assert plans is not None
     assert plans.context is not None
     assert plans.context[0].tolist() == [0, 1, 2, 3, 4, 5]
-    assert fit_markov(plans, seeded()).num_contexts == 8  # cells 6 and 7 were not seen
-    comparison = compare(world, ["markov"], ["sampling"], [2], **QUICK | {"length": 6}, generator=seeded())
+    assert fit_markov(plans, seeded(0)).num_contexts == 8  # cells 6 and 7 were not seen
+    comparison = compare(world, ["markov"], ["sampling"], [2], **QUICK | {"length": 6}, generator=seeded(0))
     assert comparison.rows[1].score > comparison.rows[0].score + 0.3
 
 
 def test_stochastic_worlds_are_left_to_planners_that_can_plan_there():
-    comparison = compare(Noisy(), ["uniform"], budgets=[4], **QUICK | {"seeds": 2}, generator=seeded())
+    comparison = compare(Noisy(), ["uniform"], budgets=[4], **QUICK | {"seeds": 2}, generator=seeded(0))
     assert comparison.planners == ("sampling",)
     assert any("frontier, mcts cannot plan" in note for note in comparison.notes)
-    still = compare(Fork(), ["uniform"], budgets=[4], held_out=Noisy(), **QUICK | {"seeds": 2}, generator=seeded())
+    still = compare(Fork(), ["uniform"], budgets=[4], held_out=Noisy(), **QUICK | {"seeds": 2}, generator=seeded(0))
     assert still.planners == ("sampling",)
     with refuses("`planners` must have one for stochastic worlds"):
         compare(Noisy(), ["uniform"], ["mcts"], [4], **QUICK)
@@ -339,7 +314,7 @@ def test_other_worlds_may_be_held_out():
     other = path_world()
     other.next_state = other.next_state.flip(1)
     other.reward = other.reward.flip(2)
-    comparison = compare(path_world(), ["markov"], ["sampling"], [16], held_out=other, **QUICK, generator=seeded())
+    comparison = compare(path_world(), ["markov"], ["sampling"], [16], held_out=other, **QUICK, generator=seeded(0))
     uniform, markov = comparison.rows
     assert markov.mean_score < 0.1 < uniform.mean_score
     assert markov.difference_high < 0
@@ -360,11 +335,8 @@ BAD = [
     ({"budgets": []}, ("`budgets` must be a list",)),
     ({"budgets": [0]}, ("`budgets` must be an integer of at least 1",)),
     ({"length": 0}, ("`length`",)),
-    ({"starts": 0}, ("`starts`",)),
     ({"training_starts": 5}, ("`training_starts` must be at least 20",)),
-    ({"seeds": 0}, ("`seeds`",)),
     ({"jobs": 0}, ("`jobs`",)),
-    ({"seconds": 0}, ("`seconds` must be above 0",)),
     ({"seconds": float("inf")}, ("`seconds` must be above 0",)),
     ({"progress": 1}, ("`progress` must be True or False",)),
     ({"generator": 0}, ("`generator` must be a torch.Generator",)),
@@ -390,13 +362,9 @@ def test_worlds_that_cannot_be_sent_are_compared_in_one_process(monkeypatch):
     monkeypatch.setattr(experiment, "WORKER_SECONDS", 0.0)
     world = path_world()
     world.file = sys.stderr
-    comparison = compare(world, ["markov"], ["sampling"], [2], **QUICK | {"seeds": 2}, jobs=2, generator=seeded())
+    comparison = compare(world, ["markov"], ["sampling"], [2], **QUICK | {"seeds": 2}, jobs=2, generator=seeded(0))
     assert len(comparison.outcomes) == 2
     assert any("one after another" in note for note in comparison.notes)
-
-
-def test_the_baseline_comes_first():
-    assert list(name_priors(["markov", "uniform"], path_world())) == ["uniform", "markov"]
 
 
 @pytest.mark.parametrize("simulator", [simulators.Walk, simulators.Walk(), [simulators.Walk(), simulators.Walk()]])

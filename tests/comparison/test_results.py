@@ -7,7 +7,6 @@ import pytest
 from scipy import stats
 
 from neuroprior.comparison import Comparison
-from neuroprior.comparison.results import _share
 from neuroprior.comparison.trial import Outcome
 
 NOISE = np.random.default_rng(0).normal(0, 0.01, (8, 1, 3, 1, 5))
@@ -83,11 +82,6 @@ def test_sentences_say_what_was_tested():
     assert "Fewer than 5 seeds" in str(few)
     assert "*" not in str(few)
     assert "*" in str(comparison(0.5, 0.83))
-
-
-def test_numbers_are_written_as_in_the_text():
-    shown = [_share(value) for value in (0.834, 1.0, 0.996, -0.123, -0.001, 0.0, 1.207, -1.5)]
-    assert shown == [".83", "1.00", "1.00", "-.12", "0", "0", "1.21", "-1.50"]
 
 
 def test_a_figure_has_a_panel_for_each_planner_and_a_line_for_each_prior():

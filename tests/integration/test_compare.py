@@ -11,7 +11,6 @@ import torch
 
 from eval.__main__ import main
 from eval.compare import command, curriculum
-from eval.compare.command import KINDS, compare
 from eval.compare.results import Results
 from eval.worlds.suite import TASKS
 from neuroprior import GRUPrior, MarkovPrior, Plans, save
@@ -20,38 +19,6 @@ from tests.support.made_up_runs import made_up
 from tests.support.reports import FROM_ELSEWHERE
 
 pytestmark = pytest.mark.usefixtures("undrawn")
-
-BAD = [
-    (["--worlds", "nowhere"], "worlds"),
-    (["--worlds", "maze", "maze"], "worlds: each may be given once, not maze maze"),
-    (["--num-plans", "16", "100"], "num_plans"),
-    (["--num-plans", "0"], "num_plans"),
-    (["--num-plans", "16", "16"], "num_plans: each may be given once"),
-    (["--num-plans", "many"], "num_plans"),
-    (["--kinds", "lstm"], "kinds"),
-    (["--kinds", "gru", "gru"], "kinds: each may be given once"),
-    (["--context", "everything"], "context"),
-    (["--worlds", "maze", "cliff", "--context", "initial"], "context: cliff offers no context of use"),
-    (["--seeds", "0"], "seeds"),
-    (["--rounds", "-1"], "rounds"),
-    (["--steps", "0"], "steps"),
-    (["--starts", "0"], "starts"),
-    (["--training-starts", "1"], "training_starts"),
-    (["--seed", "-1"], "seed"),
-    (["--processes", "0"], "processes"),
-    (["--priors", "nowhere"], "nowhere"),
-    (["--priors", "gru"], "priors: gru is also the name of a fitted prior; give the folder as ./gru"),
-    (["--worlds", "grid", "--context", "initial"], "context: grid offers no context"),
-    (["--seed", str(2**41)], "seed"),
-]
-CURRICULUM_BAD = [
-    (["--lengths", "4", "4"], "`lengths` must"),
-    (["--lengths", "0", "4"], "lengths"),
-    (["--lengths", "2", "4"], "`lengths` must"),
-    (["--num-plans", "100"], "num_plans"),
-    (["--worlds", "nowhere"], "worlds"),
-    (["--processes", "0"], "processes"),
-]
 
 
 @pytest.fixture(autouse=True)
@@ -87,15 +54,6 @@ def test_settings_go_into_runs_and_report(tmp_path):
     assert [(one["world"], one["seed"], one["num_starts"]) for one in kept] == [("maze", 0, 5), ("maze", 1, 5)]
     assert {row["num_plans"] for row in found["rows"]} == {2, 8}
     assert {row["seeds"] for row in found["rows"]} == {2}
-
-
-def test_all_worlds_and_kinds_by_default(tmp_path):
-    found = run(tmp_path, "--seeds", "1")
-    assert found["settings"]["kinds"] == list(KINDS)
-    assert found["settings"]["worlds"] == list(TASKS)
-    assert found["settings"]["num_plans"] == [16, 64, 256, 1024, 4096]
-    assert found["settings"]["context"] == []  # as suits each world
-    assert len(list(tmp_path.glob("runs/*/*-*.json"))) == len(TASKS)
 
 
 def made_up_by_kind(asked, settings) -> dict:
@@ -171,40 +129,6 @@ def test_contexts_that_do_not_fit_are_refused_before_anything_is_done(tmp_path, 
     run(tmp_path / "out", "--worlds", "maze", "--num-plans", "4", "--priors", folder)
 
 
-def test_priors_that_do_not_fit_are_refused_before_anything_is_done(tmp_path, capsys):
-    folder = str(save(MarkovPrior(77, 0).fit(Plans(torch.zeros(3, 4, dtype=torch.long), 77)), tmp_path / "wide"))
-    assert main(["compare", "--worlds", "maze", "--priors", folder, "--out", str(tmp_path / "out")]) == 2
-    assert "actions, those of the world maze, are expected, not 77" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("name", "options", "says"), [("compare", *bad) for bad in BAD] + [("curriculum", *bad) for bad in CURRICULUM_BAD]
-)
-def test_bad_options_are_one_line(name, options, says, tmp_path, capsys):
-    assert main([name, *options, "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert says in said
-    assert said.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("name", ["worlds", "num_plans", "kinds"])
-def test_empty_lists_are_refused(name, tmp_path):
-    with pytest.raises(ValueError, match=f"`{name}` must have at least one"):
-        compare(out=str(tmp_path), **{name: []})
-
-
-@pytest.mark.parametrize("name", ["compare", "curriculum"])
-def test_help(name, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main([name, "--help"])
-    assert ended.value.code == 0
-    said = capsys.readouterr().out
-    for option in ("worlds", "seeds", "num_plans", "kinds", "context", "starts", "processes", "dask", "out"):
-        assert f"--{option}" in said
-
-
 def test_curriculum_writes_curves(tmp_path):
     options = ["--worlds", "maze", "grid", "--lengths", "6", "8", "--seeds", "3", "--num-plans", "64"]
     assert main(["curriculum", *options, "--processes", "1", "--out", str(tmp_path)]) == 0
@@ -225,3 +149,9 @@ def test_curriculum_writes_curves(tmp_path):
         == 0
     )
     assert results(tmp_path / "own")["settings"]["rounds"] == curriculum.ROUNDS
+
+
+@pytest.mark.parametrize("name", ["worlds", "num_plans", "kinds"])
+def test_empty_lists_are_refused(name, tmp_path):
+    with pytest.raises(ValueError, match=f"`{name}` must have at least one"):
+        command.compare(out=str(tmp_path), **{name: []})

@@ -20,7 +20,7 @@ from neuroprior import MarkovPrior, Plans, SamplingPlanner, UniformPrior, oracle
 from neuroprior.worlds import labyrinth
 from neuroprior.worlds.labyrinth import WATER
 from tests.support.chains import markov_plans, markov_probs
-from tests.support.sources import FALSE_ALARM, every_plan, in_world_distribution, seeded
+from tests.support.sources import FALSE_ALARM, seeded
 
 INNER = range(63)
 TINY = MiceSettings(2, 6, (2, 8), (4, 8), 200, 5, 0)
@@ -50,29 +50,9 @@ def test_left_is_drawn_on_the_left():
             assert int(world.next_state[child, 2 + move]) == node
 
 
-def test_first_branches_lie_up_or_to_the_left_of_the_drawing():
-    """Numbers follow the drawing: that the first branch is now the left, now the right one comes from the headings."""
-    place = coordinates(labyrinth())
-    for node in INNER:
-        first, second = (place[2 * node + branch] - place[node] for branch in (1, 2))
-        assert torch.equal(first, -second)
-        assert float(first[1] - first[0]) > 0
-
-
 def test_ends_fill_a_square_of_eight_by_eight():
     ends = {tuple(end) for end in coordinates(labyrinth())[63:].tolist()}
     assert ends == set(itertools.product(range(-7, 8, 2), repeat=2))
-
-
-def test_no_corridor_crosses_another():
-    """Every cell of the 15 x 15 belongs to one corridor at most, the one from the home cage included."""
-    place, cells = coordinates(labyrinth()), [(x, 0) for x in range(-7, 1)]
-    for node in range(1, 127):
-        way = place[node] - place[parent(node)]
-        length = int(way.abs().sum())
-        cells += [tuple((place[parent(node)] + way / length * step).tolist()) for step in range(1, length + 1)]
-    assert len(cells) == len(set(cells)) == 8 + 2 * 4 + 4 * 4 + 8 * 2 + 16 * 2 + 32 + 64
-    assert max(abs(value) for cell in cells for value in cell) == 7
 
 
 def test_passages_and_turns_of_one_walk():
@@ -90,14 +70,6 @@ def test_passages_and_turns_of_one_walk():
     assert (float(share[0]), float(share[nodes[4]])) == (0.5, 0.0)
 
 
-def test_every_corridor_was_walked_and_moves_are_all_counted():
-    plans = read_plans(DATA)
-    walked = passages(plans)
-    stays = int((plans.context == labyrinth().next_state[plans.context, plans.actions.long()]).sum())
-    assert int(walked.sum()) == plans.actions.numel() + stays
-    assert int(walked.min()) > 0
-
-
 def test_the_far_node_is_as_far_as_can_be():
     start = far_from_water(labyrinth(absorbing=True))
     needed = [float(oracle(labyrinth(), start, moves, objective="return")) for moves in (11, 12)]
@@ -112,14 +84,6 @@ def reaching(length: int) -> torch.Tensor:
     for _ in range(length):
         reached = (legal * reached[world.next_state]).sum(1) / legal.sum(1)
     return reached
-
-
-@pytest.mark.parametrize("node", [57, 115, 28])
-def test_the_probability_is_that_of_all_plans(node):
-    world = labyrinth(absorbing=True)
-    probs = in_world_distribution(UniformPrior(4), world, node, 4)
-    found = world.rollout(torch.tensor([node]), every_plan(4, 4)[None]).rewards[0].sum(-1) > 0
-    assert float(probs[found].sum()) == pytest.approx(float(reaching(4)[node]), abs=1e-6)
 
 
 @pytest.mark.parametrize("node", [57, 115, 13, 0])
@@ -264,24 +228,3 @@ def test_figures_are_written(tiny_run):
     for name in ("mice_planner.png", "maze.png", "maze_plans.png"):
         assert (tiny_run / name).read_bytes().startswith(b"\x89PNG")
     assert [path.name for path in tiny_run.glob(".*")] == [".neuroprior.json"]
-
-
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (["--seeds", "1"], "`seeds` must be at least 2"),
-        (["--starts", "127"], "`starts` must be integers from 1 to 126"),
-        (["--num-plans", "4", "0"], "num_plans"),
-        (["--num-plans", "4", "4"], "num_plans: each may be given once"),
-        (["--lengths", "501"], "`lengths` must be integers from 1 to 500"),
-        (["--lengths", "long"], "lengths"),
-        (["--steps", "0"], "steps"),
-        (["--training-plans", "2", "--seeds", "2"], "training_plans"),
-    ],
-)
-def test_bad_options_are_one_line(options, says, tmp_path, capsys):
-    assert main(["mice", *options, "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert says in said
-    assert said.count("\n") == 1
-    assert not (tmp_path / "out" / "results.json").exists()

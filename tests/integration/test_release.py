@@ -8,7 +8,6 @@ import tomllib
 from pathlib import Path
 
 import pytest
-import yaml
 
 import neuroprior
 
@@ -102,18 +101,3 @@ def test_the_top_level_has_its_names_and_rooms() -> None:
     assert neuroprior.priors.MarkovPrior is neuroprior.MarkovPrior
     with pytest.raises(AttributeError, match="no attribute 'MarkovPriors'"):
         _ = neuroprior.MarkovPriors
-
-
-def test_issue_forms_are_well_formed() -> None:
-    """What GitHub asks of them: a name, a description, and fields with an id and a label."""
-    forms = [
-        yaml.safe_load(path.read_text(encoding="utf-8")) for path in (ROOT / ".github/ISSUE_TEMPLATE").glob("*.yml")
-    ]
-    assert len({form["name"] for form in forms}) == len(forms) >= 3
-    for form in forms:
-        assert form["description"]
-        assert len({field["id"] for field in form["body"]}) == len(form["body"])
-        for field in form["body"]:
-            assert field["type"] in ("textarea", "input", "dropdown")
-            assert field["attributes"]["label"]
-            assert ("options" in field["attributes"]) == (field["type"] == "dropdown")

@@ -264,14 +264,6 @@ def test_a_file_alone_is_learned_by_the_combined_prior(plans_file, tmp_path):
     assert load(tmp_path / "other").log_prob(some_plans(60)).equal(prior.log_prob(some_plans(60)))
 
 
-def test_a_long_sequence_is_read_in_windows(tmp_path):
-    write_plans(Plans((torch.arange(6000) // 3 % 4)[None], 4), tmp_path / "plans.npz")
-    exactly = ["--window", "16", "--prior.dropout", "0", "--prior.lags", "16", "--max_steps", "120"]
-    assert main([*small("gru", tmp_path / "run"), str(tmp_path / "plans.npz"), *exactly]) == 0
-    assert metrics(tmp_path / "run")["unit"] == "parts of the sequence"
-    assert metrics(tmp_path / "run")["rows"][-1]["bits_per_action"] < 0.5
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -289,11 +281,9 @@ def test_a_long_sequence_is_read_in_windows(tmp_path):
         ("PLANS --effort quick", ["effort", "standard", "quick"]),
         ("PLANS --modes 2", ["SwitchingPrior", "CombinedPrior"]),
         ("PLANS --validation 0.6 --held_out 0.5", ["must be above 0 and below 1, got 1.1"]),
-        ("PLANS --past_durations -1", ["`past_durations`"]),
         ("PLANS --folds 61", ["`folds` must be from 1 to 60, the number of plans"]),
         ("PLANS --max_steps 0", ["`max_steps` must be a whole number of at least 1, got 0."]),
         ("PLANS --learning_rate=-1", ["`learning_rate`"]),
-        ("PLANS --weight_decay=-1", ["`weight_decay`"]),
         ("PLANS --out .", ["`out` must be a new or empty folder, got ."]),
         ("--config gru --world null", ["`plans`"]),
     ],

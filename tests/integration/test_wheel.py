@@ -11,7 +11,6 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from neuroprior.__main__ import main
 from neuroprior.cli.example import example
 
 ROOT = Path(__file__).parents[2]
@@ -110,21 +109,3 @@ def test_bad_input_is_one_line(installed: Path, tmp_path: Path) -> None:
     said = run(installed, tmp_path, "sample", "nowhere", "--num-plans", "0", code=2).stderr
     assert said.startswith('error: Parser key "num_plans": Not of type PositiveInt: 0')
     assert said.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["score", "nowhere", "plans.csv"], "nowhere"),
-        (["sample", "nowhere"], "nowhere"),
-        (["fit", "--config", "gruu", "x.csv"], "gru"),
-        (["report", "nowhere.csv"], "nowhere.csv"),
-        (["example", "."], "ends in .csv"),
-        (["paint"], "there are check, fit, report, score, sample"),
-    ],
-)
-def test_each_command_names_what_is_wrong(words: list[str], says: str, capsys: pytest.CaptureFixture) -> None:
-    assert main(words) == 2
-    said = capsys.readouterr().err
-    assert len(said.splitlines()) == 1
-    assert says in said

@@ -105,6 +105,10 @@ def test_all_candidates_are_kept_on_demand(kind, any_prefix, objective):
     assert planner.plan(world, state, seeded(0)).candidates is None
     planner.steps_at_once = 40  # in chunks of a few starts
     plain = planner.plan(world, state, seeded(0))
+    if any_prefix:
+        own = world.rollout(state, plain.plan[:, None], keep_states=True)
+        scores = planner.prefix_scores(own.rewards, own.states)[:, 0]
+        torch.testing.assert_close(scores.gather(1, plain.lengths[:, None] - 1)[:, 0], plain.score)
     planner.keep_candidates = True
     decision = planner.plan(world, state, seeded(0))
     assert decision.plan.equal(plain.plan)

@@ -5,7 +5,7 @@ import torch
 
 from neuroprior import ExhaustivePlanner, SamplingPlanner, TabularWorld, UniformPrior, collect, gridworld
 from neuroprior.planners import execute
-from tests.support.sources import corridor, random_world, refuses, seeded, stochastic_world
+from tests.support.sources import corridor, random_world, refuses, seeded
 
 
 def test_an_open_loop_is_the_plan():
@@ -60,30 +60,6 @@ def test_a_closed_loop_responds_to_random_outcomes():
     closed, opened = (execute(planner, world, state, 2, every, seeded(0)).rewards[:, -1].mean() for every in (1, 2))
     assert closed == 1
     assert abs(float(opened) - 0.5) < 0.05
-
-
-def test_the_same_seed_does_the_same():
-    world, state = stochastic_world(0), torch.arange(5)
-    planner = SamplingPlanner(UniformPrior(3), 3, 10)
-    first, second = (execute(planner, world, state, 5, generator=seeded(3)) for _ in range(2))
-    for one, other in zip(first[:3], second[:3], strict=True):
-        assert torch.equal(one, other)
-
-
-@pytest.mark.parametrize(
-    ("given", "word"),
-    [({"num_steps": 0}, "num_steps"), ({"replan_every": 0}, "replan_every"), ({"replan_every": 4}, "fewer")],
-)
-def test_refuses(given, word):
-    world = random_world(0)
-    with refuses(word):
-        execute(ExhaustivePlanner(3), world, world.reset(2, seeded(0)), **({"num_steps": 5, "replan_every": 2} | given))
-
-
-def test_refuses_to_execute_beyond_the_prefix_that_won():
-    world = TabularWorld(torch.tensor([[1], [2], [2]]), torch.tensor([0.0, 1.0, 0.0]))
-    with refuses("fewer"):
-        execute(ExhaustivePlanner(3, any_prefix=True), world, torch.tensor([0]), 3, replan_every=3)
 
 
 def test_of_many_starts_the_shortest_prefix_that_won_says_how_many_actions_there_are():

@@ -6,20 +6,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import (
-    ExhaustivePlanner,
     GRUPrior,
     MarkovPrior,
     Plans,
     SamplingPlanner,
     TabularWorld,
     UniformPrior,
-    collect,
-    gridworld,
     oracle,
 )
 from neuroprior.planners import FrontierPlanner, frontier
-from neuroprior.worlds import cube, egocentric, maze
-from tests.support.sources import random_world, refuses, seeded, stochastic_world
+from neuroprior.worlds import cube
+from tests.support.sources import random_world, seeded
 
 HOW = (
     {},
@@ -106,12 +103,6 @@ def test_plans_are_legal_even_where_nothing_is_worth_anything():
             now = world.step(now, action)[0]
 
 
-def test_no_starts():
-    world = random_world(0)
-    decision = FrontierPlanner(UniformPrior(3), 3, 5).plan(world, torch.zeros(0, dtype=torch.long), seeded(0))
-    assert decision.plan.shape == (0, 3)
-
-
 def test_steps_that_are_not_needed_at_first_are_for_later():
     planner = FrontierPlanner(UniformPrior(3), 4, 20)
     assert planner._widths(3) == [3, 9, 27, 41]
@@ -156,40 +147,6 @@ def test_other_states_than_numbers():
     sampled = SamplingPlanner(prior, 3, 300, **how).plan(world, state, seeded(1)).score
     assert (found == 1).all()
     assert sampled.mean() < 0.9
-
-
-def test_egocentric_mazes_are_nearly_solved():
-    """256 plans of 16 steps in mazes of 15 x 15: less than 2 % from the oracle, where samples lose 5 % or more."""
-    learn_in, world = (
-        egocentric(maze(15, 15, num_layouts=5, num_worlds=5, reward_power=8, seed=seed)) for seed in (1, 2)
-    )
-    prior = MarkovPrior(3, 3).fit(collect(ExhaustivePlanner(7), learn_in, 500, generator=seeded(0)))
-    state = world.reset(200, seeded(1))
-    best = oracle(world, state, 16).double().mean()
-    found = FrontierPlanner(prior, 16, 256).plan(world, state, seeded(2))
-    assert found.model_steps <= 16 * 256
-    assert found.score.double().mean() > 0.98 * best
-    sampled = SamplingPlanner(prior, 16, 256).plan(world, state, seeded(2))
-    assert sampled.score.double().mean() < 0.95 * best
-
-
-@pytest.mark.parametrize(
-    ("given", "word"),
-    [({"length": 0}, "length"), ({"num_plans": 0}, "num_plans"), ({"temperature": -1.0}, "temperature")],
-)
-def test_refuses(given, word):
-    with refuses(word):
-        FrontierPlanner(UniformPrior(4), **({"length": 2, "num_plans": 2} | given))
-
-
-def test_refuses_worlds_and_priors():
-    state = torch.zeros(2, dtype=torch.long)
-    with refuses("deterministic"):
-        FrontierPlanner(UniformPrior(3), 2, 2).plan(stochastic_world(0), state)
-    with refuses("must have 3 actions", "got 4", "3"):
-        FrontierPlanner(UniformPrior(4), 2, 2).plan(random_world(0), state)
-    with refuses("state"):
-        FrontierPlanner(UniformPrior(4), 2, 2).plan(gridworld(3, 3), state + 9)
 
 
 def test_of_plans_that_meet_the_one_with_the_higher_discounted_return_goes_on():

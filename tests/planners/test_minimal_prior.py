@@ -13,7 +13,6 @@ from neuroprior.planners import FrontierPlanner
 from neuroprior.priors import AdaptivePrior, MixturePrior, infer
 from neuroprior.puzzles import LevinPlanner, sliding_tiles
 from neuroprior.sampling import Steppable, sample, sample_in_world
-from neuroprior.testing import check_planner
 from tests.support.sources import random_world, refuses, seeded, stochastic_world
 
 
@@ -78,15 +77,6 @@ def test_planning(kind_of_planner, kind):
         return
     planners = [kind_of_planner(prior, 4, 12, objective="return") for prior in (CHAIN, FITTED)]
     assert same(*(planner.plan(world, state, seeded(1)) for planner in planners))
-
-
-@pytest.mark.parametrize("kind_of_planner", [SamplingPlanner, FrontierPlanner, MCTSPlanner])
-def test_planners_conform_with_a_minimal_prior(kind_of_planner):
-    def make(prior, length, num_plans):
-        assert isinstance(prior, UniformPrior)
-        return kind_of_planner(Minimal(torch.zeros(prior.num_actions + 1, prior.num_actions)), length, num_plans)
-
-    check_planner(make)
 
 
 def test_what_does_not_fit_is_refused():

@@ -83,21 +83,6 @@ def test_candidates_come_from_each_source_by_its_share():
     assert planner.sources.shares(world).tolist() == pytest.approx(moved)
 
 
-def test_the_right_source_takes_over_and_again_after_a_change():
-    """After ten decisions each, whichever of the two is right: a uniform prior alone would reach less."""
-    world, start = Coin(0), torch.zeros(1, dtype=torch.long)
-    planner, generator = SamplingPlanner([always(0), always(1)], 6, 20), seeded(0)
-    for good in (0, 1, 0):
-        world.good = good
-        scores = [float(planner.plan(world, start, generator).score) for _ in range(30)]
-        assert scores[10:] == [6.0] * 20
-        assert float(planner.sources.shares(world)[good]) > 0.7
-    world.good = 2  # neither knows it
-    for _ in range(30):
-        planner.plan(world, start, generator)
-    assert float(planner.sources.shares(world)[2]) > 0.7
-
-
 def test_a_uniform_prior_is_always_among_them():
     assert [type(one).__name__ for one in Sources([always(0)]).priors] == ["MarkovPrior", "UniformPrior"]
     assert len(Sources([always(0), UniformPrior(3)]).priors) == 2

@@ -1,14 +1,13 @@
 """Uniform shares, and how temperature and share are chosen: by enumeration, and in worlds with one good plan."""
 
 from itertools import product
-from math import log
 
 import pytest
 import torch
 
 from neuroprior import CombinedPrior, MarkovPrior, Plans, SamplingPlanner, TabularWorld, UniformPrior
 from neuroprior.planners import best_sampling, proposers, search_weights
-from neuroprior.planners.tuning import choices, log_inclusion
+from neuroprior.planners.tuning import choices
 from neuroprior.priors import MixturePrior
 from neuroprior.testing import check_planner
 from neuroprior.worlds import gridworld
@@ -31,19 +30,6 @@ def sure_of(action: int, order: int = 0) -> MarkovPrior:
 
 def candidates(planner: SamplingPlanner, world: TabularWorld, starts: int = 20) -> torch.Tensor:
     return planner.candidates(world, torch.zeros(starts, dtype=torch.long), seeded(0))[0]
-
-
-@pytest.mark.parametrize(("share", "number"), [(0.0, 0), (0.1, 2), (0.3, 6), (1.0, 20)])
-def test_so_many_candidates_are_uniform(share, number):
-    """A prior of ones: of P uniform plans of 8 moves, 2 ** -8 are all ones, in 20 starts at most 3 (p < 1e-3)."""
-    prior = MarkovPrior(2, 0, smoothing=1e-9, backoff="dirichlet").fit(torch.ones(500, 8, dtype=torch.long))
-    world = gridworld(5, 5)
-    world = TabularWorld(world.next_state[:, :2], torch.zeros(25))
-    plans = candidates(SamplingPlanner(prior, 8, 20, uniform_share=share), world)
-    assert plans.shape == (20, 20, 8)
-    assert bool((plans[:, : 20 - number] == 1).all())
-    assert int((plans[:, 20 - number :] == 1).all(-1).sum()) <= 3 * (number + 1)
-    assert float(plans[:, 20 - number :].float().mean()) == pytest.approx(0.5, abs=0.2) or not number
 
 
 def test_without_a_share_nothing_changes():
@@ -141,11 +127,6 @@ def test_an_expert_that_was_left_out_proposes_where_it_is_right():
     assert found.scores[even, 1.0, 0.0] == pytest.approx(15 / 16, abs=5 * (15 / 16 / 16 / 200) ** 0.5)
 
 
-def test_a_mixture_of_one_proposes_itself():
-    mixture = MixturePrior(2, [sure_of(0)])
-    assert proposers(mixture) == (mixture,)
-
-
 def test_luck_does_not_win_in_a_stochastic_world():
     """Action 0 is worth 0.3, 1 nothing. Of 64 tries of it one succeeds, whichever setting: by new rollouts 0.3."""
     world, state = bandit(0.3), torch.zeros(400, dtype=torch.long)
@@ -209,16 +190,6 @@ def test_in_a_stochastic_world_what_is_tuned_is_what_is_found(any_prefix):
     assert tuned.scores[prior, 1.0, 0.5] == pytest.approx(float(found), abs=5 * (0.25 / 16_000) ** 0.5)
 
 
-def chance(prior: MarkovPrior, plan: list[int], heat: float, share: float, number: int) -> float:
-    """That one of `number` candidates is a plan, from the prior's steps."""
-    prob, logits, state = 1.0, *prior.start(1)
-    for at, action in enumerate(plan):
-        prob *= float((logits.double() / heat).softmax(-1)[0, action])
-        if at + 1 < len(plan):
-            logits, state = prior.step(torch.tensor([action]), state)
-    return 1 - (1 - (1 - share) * prob - share / prior.num_actions ** len(plan)) ** number
-
-
 @pytest.mark.parametrize("number", [1, 2, 64, 4096])
 def test_weights_are_the_gradient(number):
     """Of -log(1 - (1 - p) ** P), with respect to log p."""
@@ -232,25 +203,3 @@ def test_weights_at_the_ends():
     ends = torch.tensor([0.0, -1000.0, -float("inf")])
     assert search_weights(ends, 64).tolist() == pytest.approx([0.0, 1.0, 1.0])
     assert search_weights(ends, 1).tolist() == pytest.approx([1.0, 1.0, 1.0])
-
-
-def test_nothing_to_try():
-    world, prior = bandit(), UniformPrior(2)
-    state = torch.zeros(2, dtype=torch.long)
-    with refuses("`prior` must have 4 actions, as the world, got 3"):
-        best_sampling(UniformPrior(3), gridworld(4, 4), torch.arange(16), 4, 8)
-    with refuses("`temperatures` must have at least one"):
-        best_sampling(prior, world, state, 1, 4, temperatures=())
-    with refuses("`temperature` must be a positive"):
-        best_sampling(prior, world, state, 1, 4, temperatures=(0,))
-    with refuses("`state` must have at least one start"):
-        best_sampling(prior, world, state[:0], 1, 4)
-    with refuses("at most 0"):
-        search_weights(torch.tensor([0.1]), 4)
-    with refuses("at most 0"):
-        search_weights(torch.tensor([float("nan")]), 4)
-
-
-def test_tiny_probabilities_keep_their_logarithms():
-    small = torch.tensor([-50.0, -599.0, -601.0, -5000.0], dtype=torch.float64)
-    assert torch.allclose(log_inclusion(small, 64), small + log(64), rtol=1e-12)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from neuroprior import MarkovPrior, SamplingPlanner, TabularWorld, UniformPrior, gridworld
+from neuroprior import MarkovPrior, Plans, SamplingPlanner, TabularWorld, UniformPrior, gridworld
 from neuroprior.planners import Decision, expected_score
 from neuroprior.planners.warm_start import continue_plans, with_rest
 from neuroprior.worlds import labyrinth
@@ -101,13 +101,15 @@ def test_in_a_stochastic_world_both_have_the_same_rollouts():
 
 
 def test_the_context_is_the_observation_where_the_rest_leads():
-    world = gridworld(4, 4)
-    state = world.reset(50, seeded(0))
-    prior = MarkovPrior(4, 1, num_contexts=16)
-    plans, _ = continue_plans(
-        prior, world, state, torch.zeros(50, 2, dtype=torch.long), torch.full((50,), 2), 4, seeded(0)
-    )
-    assert (plans[:, 0, :2] == 0).all()
+    """The prior takes action `cell % 4` in each cell."""
+    world, cells = gridworld(4, 4), torch.arange(16).repeat(50)
+    plans = Plans((cells % 4)[:, None], 4, context=cells[:, None])
+    prior = MarkovPrior(4, 0, 1e-9, backoff="dirichlet", num_contexts=16).fit(plans)
+    prior.context_per = "step"
+    state, rest = world.reset(50, seeded(0)), torch.zeros(50, 2, dtype=torch.long)
+    found, rollout = continue_plans(prior, world, state, rest, torch.full((50,), 2), 4, seeded(0))
+    assert (found[:, 0, :2] == 0).all()
+    assert found[:, 0, 2:].long().equal(rollout.states[:, 0, 1:3] % 4)
 
 
 def test_in_a_stochastic_world_nothing_beyond_the_end_of_a_plan_wins():

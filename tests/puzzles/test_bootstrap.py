@@ -247,14 +247,6 @@ def test_symmetries_of_solutions_are_solutions() -> None:
         assert all(one.equal(other) for one, other in zip(steps, same, strict=True))
 
 
-def test_priors_without_patterns_learn_too() -> None:
-    world = cube("quarter", scramble=4)
-    prior = MarkovPrior(6, 2)
-    state = world.reset(50, seeded(4))
-    sweeps = list(bootstrap(world, prior, state, max_nodes=400, sweeps=2, generator=seeded(0)))
-    assert sweeps[-1].mean_expansions < sweeps[0].mean_expansions
-
-
 def unused(state: Tensor) -> Tensor:
     raise AssertionError
 

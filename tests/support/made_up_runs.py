@@ -1,9 +1,6 @@
-"""Runs of a comparison that are made up, quickly, for tests; as a program, the command with made-up runs."""
+"""Runs of a comparison that are made up, quickly, for tests."""
 
-import os
 import random
-import sys
-import time
 from typing import Any
 
 from eval.compare.run import Settings
@@ -13,8 +10,7 @@ PRIORS = ("uniform", "markov-1", "gru")
 
 
 def made_up(run: Run, settings: Settings) -> dict[str, Any]:
-    """The same results for the same run and settings; slow where `SLOW` says how many seconds."""
-    time.sleep(float(os.environ.get("SLOW", 0)))
+    """The same results for the same run and settings."""
     draw = random.Random(f"{run.world} {run.seed} {settings}").random
     budgets = [2**k for k in range(max(settings.num_plans).bit_length())]
     entries = [
@@ -42,27 +38,3 @@ def made_up(run: Run, settings: Settings) -> dict[str, Any]:
         "curriculum": curriculum,
         "action_names": None,
     }
-
-
-def broken(run: Run, settings: Settings) -> dict[str, Any]:
-    """A run that fails for seed 1."""
-    if run.seed == 1:
-        raise ValueError("no plan scored more than 0")
-    return made_up(run, settings)
-
-
-def killed(run: Run, settings: Settings) -> dict[str, Any]:
-    """A run whose process is killed for seed 1, as where memory runs out."""
-    if run.seed == 1:
-        os.kill(os.getpid(), 9)
-    return made_up(run, settings)
-
-
-if __name__ == "__main__":
-    from eval.__main__ import main
-    from eval.compare import command
-    from tests.support import made_up_runs
-
-    # A function of this very module would be looked for in the main module of the processes that are started.
-    command.compare_run = made_up_runs.made_up
-    sys.exit(main())

@@ -145,13 +145,6 @@ SIGMAS = 5
 """Standard errors by which two means may differ: by chance more with a probability of 6e-7."""
 
 
-def means_agree(first, second):
-    """Whether two samples may have the same mean, up to `SIGMAS` standard errors."""
-    first, second = (np.asarray(x, dtype=float) for x in (first, second))
-    error = np.sqrt(first.var() / len(first) + second.var() / len(second))
-    return abs(first.mean() - second.mean()) <= SIGMAS * error
-
-
 class ReusedReward:
     """Returns the same array as reward after each step, with another value."""
 

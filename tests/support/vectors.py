@@ -1,8 +1,9 @@
-"""A small world and a small prior of vectors."""
+"""A small world, a small prior and plans of vectors."""
 
 import torch
 
-from neuroprior.control import ContinuousWorld, GaussianForecast, VectorPrior
+from neuroprior.control import ContinuousWorld, GaussianForecast, VectorPlans, VectorPrior
+from tests.support.sources import seeded
 
 
 class Cart(ContinuousWorld):
@@ -61,3 +62,11 @@ class Drift(VectorPrior):
 
 def drift(world, **how):
     return Drift(world.action_low, world.action_high, **how)
+
+
+def walks(num, length, size, seed):
+    """Stationary autoregressions of order 1, of standard deviation .15."""
+    values = [torch.zeros(num, size)]
+    for noise in torch.randn(length + 50, num, size, generator=seeded(seed)):
+        values.append(0.95 * values[-1] + (1 - 0.95**2) ** 0.5 * noise)
+    return VectorPlans((0.15 * torch.stack(values[-length:], 1)).clamp(-1, 1), [-1.0] * size, [1.0] * size)

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from inspect import isabstract
-from typing import Self
 
 import numpy as np
 import pytest
@@ -33,7 +32,7 @@ from neuroprior.puzzles import LogLinearPrior, sliding_tiles, sokoban
 from neuroprior.sampling.states import tensors_in
 from neuroprior.testing import check_prior, check_world
 from neuroprior.testing.chi_square import alike, chi_square
-from neuroprior.worlds import Features, Rollout, cube, egocentric, four_rooms, maze
+from neuroprior.worlds import Features, Rollout, cube, egocentric, four_rooms, labyrinth, maze
 from tests.support.sources import stochastic_world
 
 SOKOBAN = ["#######\n#@ $ .#\n#######", "######\n#.$  #\n# +$ #\n#    #\n######"]
@@ -128,6 +127,7 @@ WORLDS = {
     "maze": maze(7, 9, num_layouts=3, num_worlds=2),
     "four rooms": four_rooms(egocentric=True, view=2, reward="goal"),
     "egocentric": egocentric(gridworld(5, 5, "torus")),
+    "labyrinth": labyrinth(absorbing=True),
     "taxi": from_gymnasium("Taxi-v4"),
     "ice": from_gymnasium("FrozenLake-v1", starts="any"),
     "cart and pole": from_gymnasium("CartPole-v1", seeds=range(3)),
@@ -291,189 +291,173 @@ def test_integers_of_every_kind_and_layout_mean_the_same_to_a_world(world: World
             world.step(state, none)
 
 
+def with_parts(kind, **parts):
+    """A class with other attributes and methods."""
+    return type("Changed", (kind,), parts)
+
+
 class Broken(MarkovPrior):
     """A right prior, to be broken in one place."""
 
-    def __init__(
-        self, num_actions: int = 3, order: int = 2, num_contexts: int | None = None, **settings: object
-    ) -> None:
+    def __init__(self, num_actions=3, order=2, num_contexts=None, **settings):
         super().__init__(num_actions, order, num_contexts=num_contexts)
         self.fit(random_plans(num_actions, None if num_contexts is None else index_context(60) % num_contexts))
 
 
-class WrongStep(Broken):
-    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        logits, state = super().step(action, state)
-        return logits.roll(1, -1), state
+def starting(change):
+    """`Broken`, whose `start` returns `change(logits, state)`."""
 
-    def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
-        return torch.zeros(*plans.shape, self.num_actions)
+    class Changed(Broken):
+        def start(self, batch_size, context=None):
+            return change(*super().start(batch_size, context))
 
-
-class HiddenMemory(Broken):
-    """Keeps what it knows of a row in itself, so that reordering the state does not reorder it."""
-
-    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        logits, state = super().step(action, state)
-        return logits + torch.arange(len(action))[:, None] * torch.arange(self.num_actions) / 10, state
+    return Changed
 
 
-class Together(Broken):
-    """Takes the mean of the logits of all plans that it is asked for together."""
+def stepping(change):
+    """`Broken`, whose `step` returns `change(logits, state)`."""
 
-    forward = Prior.forward
+    class Changed(Broken):
+        def step(self, action, state, context=None):
+            return change(*super().step(action, state, context))
 
-    def __init__(self, method: str) -> None:
-        super().__init__(num_contexts=2)
-        self.method = method
-
-    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        logits, state = super().start(batch_size, context)
-        return logits.mean(0).expand_as(logits) if self.method == "start" else logits, state
-
-    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        logits, state = super().step(action, state, context)
-        return logits.mean(0).expand_as(logits) if self.method == "step" else logits, state
+    return Changed
 
 
-class AllTogether(Broken):
-    def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
-        return super().forward(plans, context).mean(0).expand(*plans.shape, -1)
+def reading(change):
+    """`Broken`, whose `forward` returns `change(logits)`."""
+    return with_parts(Broken, forward=lambda self, plans, context=None: change(Broken.forward(self, plans, context)))
 
 
-class WholeNumbers(Broken):
-    def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
-        return super().forward(plans, context).long()
+def scoring(log_prob):
+    """`Broken` with another `log_prob`, of the actions of plans."""
+    return with_parts(Broken, log_prob=lambda self, plans: log_prob(self, getattr(plans, "actions", plans)))
 
 
-class Unnormalised(Broken):
-    def log_prob(self, plans: Plans | Tensor) -> Tensor:
-        return super().log_prob(plans) + 0.1
-
-
-class WrongSamples(Broken):
-    """Says one distribution in `log_prob` and samples from another."""
-
-    def log_prob(self, plans: Plans | Tensor) -> Tensor:
-        actions = plans.actions if isinstance(plans, Plans) else plans
-        return super().log_prob((actions.long() + 1) % self.num_actions)
-
-
-class GlobalRandomness(Broken):
-    def sample(self, num_plans: int, length: int, *args: object, **settings: object) -> Tensor:
-        return torch.randint(self.num_actions, (num_plans, length))
+def mean_of_all(logits, state):
+    """The mean of the logits of all plans that it is asked for together."""
+    return logits.mean(0).expand_as(logits), state
 
 
 class Forgetful(Broken):
     """Saves too little to be made again."""
 
-    def __init__(self, num_actions: int = 3, bonus: float = 0.0, **settings: object) -> None:
+    def __init__(self, num_actions=3, bonus=0.0, **settings):
         super().__init__(num_actions)
         self.log_probs[:, 0] += bonus
         self.log_probs.sub_(self.log_probs.logsumexp(1, keepdim=True))
 
-    def state_dict(self, *args: object, **settings: object) -> dict[str, Tensor]:
+    def state_dict(self, *args, **settings):
         return {}
 
-    def load_state_dict(self, *args: object, **settings: object) -> None:
+    def load_state_dict(self, *args, **settings):
         pass
 
 
 class ReadsContext(Prior):
     """Reads a context in each step, also where there is one for the whole plan."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__(3, context_size=3)
 
-    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        assert context is not None
+    def start(self, batch_size, context=None):
         return context, torch.zeros(batch_size, 1)
 
-    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        return context * 2, state  # type: ignore[operator]
+    def step(self, action, state, context=None):
+        return context * 2, state
 
-    def fit(self, plans: Plans | Tensor, **settings: object) -> Self:
+    def fit(self, plans, **settings):
         return self
-
-
-class OneMore(Broken):
-    """Gives one more logit."""
-
-    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        logits, state = super().start(batch_size)
-        return torch.nn.functional.pad(logits, (0, 1)), state
-
-
-class Integers(Broken):
-    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        logits, state = super().step(action, state)
-        return logits.long(), state
-
-
-class Arrays(Broken):
-    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        logits, state = super().start(batch_size)
-        return logits.numpy(), state  # type: ignore[return-value]
-
-
-class LogitsAlone(Broken):
-    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        return super().start(batch_size)[0]  # type: ignore[return-value]
 
 
 class Overwrites(Broken):
     """Changes the state that it is given."""
 
-    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def step(self, action, state, context=None):
         logits, after = super().step(action, state)
         return logits, state.copy_(after)
 
 
 class FitsToNothing(Broken):
-    def fit(self, plans: Plans | Tensor, **settings: object) -> Self:
+    def fit(self, plans, **settings):
         super().fit(plans)
-        return None  # type: ignore[return-value]
 
 
 class Unsavable(Broken):
     """Its `config` is not what its constructor takes."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
 
 
 @pytest.mark.parametrize(
     ("broken", "message"),
     [
-        (WrongStep, "stepping differs from forward"),
-        (HiddenMemory, "stepping differs from forward|with the plans beside it"),
-        (partial(Together, "start"), "^forward: the logits of a plan change by .* nats with the plans beside it"),
-        (partial(Together, "step"), "^forward: the logits of a plan change by .* nats with the plans beside it"),
-        (AllTogether, "^forward: the logits of a plan change by .* nats with the plans beside it"),
-        (Unnormalised, "sum to 1.1"),
-        (WrongSamples, "do not fit log_prob"),
-        (GlobalRandomness, "same seed gave other plans|global generator"),
+        (
+            with_parts(
+                stepping(lambda logits, state: (logits.roll(1, -1), state)),
+                forward=lambda self, plans, context=None: torch.zeros(*plans.shape, 3),
+            ),
+            "stepping differs from forward",
+        ),
+        # It keeps what it knows of a row in itself, so that reordering the state does not reorder it.
+        (
+            stepping(lambda logits, state: (logits + torch.arange(len(logits))[:, None] * torch.arange(3) / 10, state)),
+            "stepping differs from forward|with the plans beside it",
+        ),
+        *(
+            (
+                partial(with_parts(together(mean_of_all), forward=Prior.forward), num_contexts=2),
+                "^forward: the logits of a plan change by .* nats with the plans beside it",
+            )
+            for together in (starting, stepping)
+        ),
+        (
+            reading(lambda logits: logits.mean(0).expand_as(logits)),
+            "^forward: the logits of a plan change by .* nats with the plans beside it",
+        ),
+        (scoring(lambda prior, actions: Broken.log_prob(prior, actions) + 0.1), "sum to 1.1"),
+        (scoring(lambda prior, actions: Broken.log_prob(prior, (actions.long() + 1) % 3)), "do not fit log_prob"),
+        (
+            with_parts(Broken, sample=lambda self, num, length, *args, **settings: torch.randint(3, (num, length))),
+            "same seed gave other plans|global generator",
+        ),
         (partial(Forgetful, bonus=1.0), "saved, loaded"),
         (ReadsContext, "step: .* `step` is given None where the last context goes on"),
         (Unsavable, "cannot be saved and loaded"),
-        (OneMore, r"^`start` must return floating point logits \[7, 3\], got torch.float32 \[7, 4\]$"),
-        (Integers, r"^`step` must return floating point logits \[7, 3\], got torch.int64 \[7, 3\]$"),
-        (WholeNumbers, r"^`forward` must return floating point logits \[7, 1, 3\], got torch.int64 \[7, 1, 3\]$"),
-        (Arrays, r"^`start` must return floating point logits \[7, 3\], got ndarray$"),
-        (LogitsAlone, r"^`start` must return logits and a state, got torch.float32 \[7, 3\]$"),
+        (
+            starting(lambda logits, state: (torch.nn.functional.pad(logits, (0, 1)), state)),
+            r"^`start` must return floating point logits \[7, 3\], got torch.float32 \[7, 4\]$",
+        ),
+        (
+            stepping(lambda logits, state: (logits.long(), state)),
+            r"^`step` must return floating point logits \[7, 3\], got torch.int64 \[7, 3\]$",
+        ),
+        (
+            reading(lambda logits: logits.long()),
+            r"^`forward` must return floating point logits \[7, 1, 3\], got torch.int64 \[7, 1, 3\]$",
+        ),
+        (
+            starting(lambda logits, state: (logits.numpy(), state)),
+            r"^`start` must return floating point logits \[7, 3\], got ndarray$",
+        ),
+        (
+            starting(lambda logits, state: logits),
+            r"^`start` must return logits and a state, got torch.float32 \[7, 3\]$",
+        ),
         (Overwrites, "^step must leave the state that it is given as it is, and return another$"),
         (FitsToNothing, "^fit must return the prior itself, got NoneType$"),
     ],
 )
-def test_a_broken_prior_fails_with_a_message(broken: Callable[[], Prior], message: str) -> None:
+def test_a_broken_prior_fails_with_a_message(broken, message):
     with pytest.raises(AssertionError, match=message):
         check_prior(broken())
 
 
 @pytest.mark.parametrize(("given", "message"), [(None, "got NoneType"), (Forgetful, "the class Forgetful")])
-def test_what_is_no_prior_fails_with_a_message(given: object, message: str) -> None:
+def test_what_is_no_prior_fails_with_a_message(given, message):
     with pytest.raises(AssertionError, match=f"`fit` has to return it.*{message}"):
-        check_prior(given)  # type: ignore[arg-type]
+        check_prior(given)
 
 
 class Line(World):
@@ -481,23 +465,35 @@ class Line(World):
 
     num_actions, observation = 2, Features(1)
 
-    def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
+    def reset(self, batch_size, generator=None):
         return torch.rand(batch_size, 1, generator=generator)
 
-    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+    def step(self, state, action, generator=None):
         after = state + (2.0 * action[:, None] - 1)
         return after, -after[:, 0].abs()
 
-    def observe(self, state: Tensor) -> Tensor:
+    def observe(self, state):
         return state
 
 
-class Undeclared(Line):
-    observation = None
+def moving(change, kind=Line, **parts):
+    """A world whose `step` returns `change(after, reward)`."""
+
+    class Changed(kind):
+        def step(self, state, action, generator=None):
+            return change(*super().step(state, action, generator))
+
+    return with_parts(Changed, **parts)
 
 
-class Miscounted(Line):
-    observation = Features(3)
+def rolling(change, kind=Line):
+    """A world whose `rollout` returns `change(found, state)`."""
+
+    class Changed(kind):
+        def rollout(self, state, plans, generator=None, keep_states=False):
+            return change(super().rollout(state, plans, generator, keep_states), state)
+
+    return Changed
 
 
 class Noisy(Line):
@@ -505,74 +501,45 @@ class Noisy(Line):
 
     stochastic = True
 
-    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+    def step(self, state, action, generator=None):
         after, reward = super().step(state, action)
         return after + torch.randn(after.shape, generator=generator), reward
 
 
 class InPlace(Line):
-    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+    def step(self, state, action, generator=None):
         state += 2.0 * action[:, None] - 1
         return state, -state[:, 0].abs()
 
 
-class IntegerReward(Line):
-    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-        return state, action
-
-
-class MixedBatch(Line):
-    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-        after, reward = super().step(state, action)
-        return after - after.mean(), reward
-
-
 class Careless(Line):
-    def rollout(self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None) -> Rollout:
+    def rollout(self, state, plans, generator=None):
         total = (2.0 * plans - 1).cumsum(-1)
         return Rollout(state[:, None] + total.sum(-1, keepdim=True), -(state[:, None] + total).abs())
 
 
 class Unchecked(Line):
-    def rollout(self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None) -> Rollout:
+    def rollout(self, state, plans, generator=None):
         places = state[:, None] + (2.0 * plans - 1).cumsum(-1)
         final = places[..., -1:] if plans.shape[-1] else state[:, None].expand(-1, plans.shape[1], -1)
         return Rollout(final, -places.abs())
 
 
-class Unannounced(Noisy):
-    stochastic = False
-
-
-class Calm(Noisy):
-    """Its rollouts have a smaller variance than its steps."""
-
-    def rollout(
-        self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
-    ) -> Rollout:
-        final, rewards, states = super().rollout(state, plans, generator, keep_states)
-        return Rollout(final, 0.9 * rewards, states)
-
-
 class Lucky(TabularWorld):
     """Each plan has random numbers of its own."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         world = stochastic_world(0)
         super().__init__(world.next_state, world.reward, probability=world.probability)
 
-    def rollout(
-        self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
-    ) -> Rollout:
+    def rollout(self, state, plans, generator=None, keep_states=False):
         return World.rollout(self, state, plans, generator, keep_states)
 
 
 class Biased(Lucky):
     """In its rollouts an action that fails is tried again, one time in two."""
 
-    def rollout(
-        self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
-    ) -> Rollout:
+    def rollout(self, state, plans, generator=None, keep_states=False):
         worse, better = (TabularWorld.rollout(self, state, plans, generator, keep_states) for _ in range(2))
         again = torch.rand(len(state), generator=generator) < 0.5
         pick = again[:, None] & (better.rewards[..., -1:] > worse.rewards[..., -1:]).any(-1)
@@ -583,105 +550,62 @@ class Biased(Lucky):
 class Ending(Line):
     """Over beyond 2: a right world, where nothing happens after the end."""
 
-    def terminated(self, state: Tensor) -> Tensor:
+    def terminated(self, state):
         return state[:, 0].abs() > 2
 
-    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+    def step(self, state, action, generator=None):
         after, reward = super().step(state, action)
         over = self.terminated(state)
         return torch.where(over[:, None], state, after), reward.masked_fill(over, 0)
 
 
 class GoesOn(Ending):
-    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+    def step(self, state, action, generator=None):
         after, reward = Line.step(self, state, action)
         return after, reward.masked_fill(self.terminated(state), 0)
 
 
 class PaysOn(Ending):
-    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+    def step(self, state, action, generator=None):
         return super().step(state, action)[0], Line.step(self, state, action)[1]
 
 
-class Unmarked(Line):
-    """Says where its goal is, which `reset` never draws, but not that it has one."""
-
-    def solved(self, state: Tensor) -> Tensor:
-        return state[:, 0] > 2
+def first_legal(self, state):
+    return torch.tensor([True, False]).expand(len(state), 2)
 
 
-class KeepsStarts(Line):
-    def rollout(
-        self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
-    ) -> Rollout:
-        found = super().rollout(state, plans, generator)
-        kept = state[:, None, None].expand(*plans.shape, 1)
-        return found._replace(states=kept if keep_states else None)
-
-
-class Unsaid(Line):
-    all_legal = True
-
-    def legal_actions(self, state: Tensor) -> Tensor:
-        return torch.tensor([True, False]).expand(len(state), 2)
-
-
-class ByPlace(Line):
-    """Which action is legal depends on the place of a state in its batch."""
-
-    all_legal = False
-
-    def legal_actions(self, state: Tensor) -> Tensor:
-        legal = torch.ones(len(state), 2, dtype=torch.bool)
-        legal[::2, 0] = False
-        return legal
-
-
-class SolvedByPlace(Line):
-    has_goal = True
-
-    def solved(self, state: Tensor) -> Tensor:
-        return torch.arange(len(state)) % 2 == 0
-
-
-class OneGroup(Line):
-    def group(self, state: Tensor) -> Tensor:
-        return torch.zeros(1, dtype=torch.long)
-
-
-class UnseededReward(Line):
-    stochastic = True
-
-    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-        return super().step(state, action)[0], torch.rand(len(state))
+def legal_by_place(self, state):
+    """It depends on the place of a state in its batch."""
+    legal = torch.ones(len(state), 2, dtype=torch.bool)
+    legal[::2, 0] = False
+    return legal
 
 
 class Strict(Line):
     """A simulator that stops at actions that are not legal."""
 
-    all_legal = False
+    all_legal, legal_actions = False, first_legal
 
-    def legal_actions(self, state: Tensor) -> Tensor:
-        return torch.tensor([True, False]).expand(len(state), 2)
-
-    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+    def step(self, state, action, generator=None):
         if (action == 1).any():
             raise RuntimeError("illegal move")
         return super().step(state, action)
 
 
-class OtherStatesOnTheWay(Line):
-    def rollout(
-        self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
-    ) -> Rollout:
-        found = super().rollout(state, plans, generator, keep_states)
-        if found.states is None:
-            return found
-        return found._replace(states=found.states[:, :, -1:].expand_as(found.states))
+def starts_for_states(found, state):
+    if found.states is None:
+        return found
+    return found._replace(states=state[:, None, None].expand_as(found.states))
+
+
+def ends_for_states(found, state):
+    if found.states is None:
+        return found
+    return found._replace(states=found.states[:, :, -1:].expand_as(found.states))
 
 
 @pytest.mark.parametrize("world", [Line, Noisy, Ending])
-def test_worlds_of_ones_own_conform(world: type[World]) -> None:
+def test_worlds_of_ones_own_conform(world):
     check_world(world())
     check_world(world(), length=1)
 
@@ -690,30 +614,44 @@ def test_worlds_of_ones_own_conform(world: type[World]) -> None:
     ("broken", "message"),
     [
         (InPlace, "changed the state"),
-        (IntegerReward, "reward of torch.int64"),
-        (MixedBatch, "depends on its batch"),
+        (with_parts(Line, step=lambda self, state, action, generator=None: (state, action)), "reward of torch.int64"),
+        (moving(lambda after, reward: (after - after.mean(), reward)), "depends on its batch"),
         (Careless, "rollout ends in other states"),
         (Unchecked, "must raise ValueError"),
-        (Unannounced, "`stochastic` is False"),
-        (Calm, "rewards of rollout do not fit"),
+        (with_parts(Noisy, stochastic=False), "`stochastic` is False"),
+        # Its rollouts have a smaller variance than its steps.
+        (rolling(lambda found, _: found._replace(rewards=0.9 * found.rewards), Noisy), "rewards of rollout do not fit"),
         (Lucky, "different random numbers"),
         (Biased, "do not fit those of steps"),
-        (Unsaid, "all_legal is True"),
-        (Undeclared, "what it gives is not declared"),
-        (Miscounted, r"`observe` must give .*Features\(size=3\), got torch.float32 \[\d+, 1\]"),
+        (with_parts(Line, all_legal=True, legal_actions=first_legal), "all_legal is True"),
+        (with_parts(Line, observation=None), "what it gives is not declared"),
+        (
+            with_parts(Line, observation=Features(3)),
+            r"`observe` must give .*Features\(size=3\), got torch.float32 \[\d+, 1\]",
+        ),
         (GoesOn, "terminated states must stay"),
         (PaysOn, "reward from terminated states must be 0"),
-        (Unmarked, "has_goal is False"),
-        (KeepsStarts, "last of the states is not the final one"),
-        (ByPlace, "legal_actions: what is found in a state depends on its batch"),
-        (SolvedByPlace, "solved: what is found in a state depends on its batch"),
-        (OneGroup, "group must return int64"),
-        (UnseededReward, "the same seed gave other rewards"),
+        # It says where its goal is, which `reset` never draws, but not that it has one.
+        (with_parts(Line, solved=lambda self, state: state[:, 0] > 2), "has_goal is False"),
+        (rolling(starts_for_states), "last of the states is not the final one"),
+        (
+            with_parts(Line, all_legal=False, legal_actions=legal_by_place),
+            "legal_actions: what is found in a state depends on its batch",
+        ),
+        (
+            with_parts(Line, has_goal=True, solved=lambda self, state: torch.arange(len(state)) % 2 == 0),
+            "solved: what is found in a state depends on its batch",
+        ),
+        (with_parts(Line, group=lambda self, state: torch.zeros(1, dtype=torch.long)), "group must return int64"),
+        (
+            moving(lambda after, reward: (after, torch.rand(len(after))), stochastic=True),
+            "the same seed gave other rewards",
+        ),
         (Strict, "stops at actions that are not legal .illegal move."),
-        (OtherStatesOnTheWay, "states on the way are not those of shorter plans"),
+        (rolling(ends_for_states), "states on the way are not those of shorter plans"),
     ],
 )
-def test_a_broken_world_fails_with_a_message(broken: type[World], message: str) -> None:
+def test_a_broken_world_fails_with_a_message(broken, message):
     with pytest.raises(AssertionError, match=message):
         check_world(broken())
 

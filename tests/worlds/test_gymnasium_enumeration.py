@@ -204,17 +204,6 @@ def test_layouts_side_by_side():
     check_world(anywhere)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "least"), [("MiniGrid-FourRooms-v0", 1000), ("MiniGrid-DoorKey-8x8-v0", 5000)], ids=["rooms", "key"]
-)
-def test_larger_minigrids(name, least):
-    world = from_gymnasium(name, seeds=[0])
-    assert world.num_states > least
-    assert float(oracle(world, world.reset(1), 100, any_prefix=True)) > 0.9
-    check_world(world)
-
-
 @pytest.mark.parametrize(
     ("env", "words"),
     [

@@ -6,7 +6,6 @@ from pathlib import Path
 import torch
 
 from neuroprior import oracle, read_plans
-from neuroprior.testing import check_world
 from neuroprior.worlds import labyrinth
 
 DATA = Path(__file__).parents[2] / "eval" / "data" / "labyrinth"
@@ -52,8 +51,3 @@ def test_water_comes_once_where_it_absorbs():
         state, reward = world.step(torch.tensor([57]), torch.tensor([int(world.next_state[57, 1] == 116)]))
         assert (state.item(), reward.item()) == (116, 1)
         assert float(oracle(world, state, 2, objective="return")) == drinks
-
-
-def test_conforms():
-    check_world(labyrinth())
-    check_world(labyrinth(absorbing=True))

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from eval.paper.values import can_reach, q_learning
 from neuroprior import TabularWorld
 from neuroprior.planners import value_iteration
-from neuroprior.testing import check_world
 from neuroprior.worlds.outcomes import Outcomes
 from tests.support.sources import FALSE_ALARM, p_value, random_world, refuses, seeded, stochastic_world, trajectories
 
@@ -91,15 +90,6 @@ def test_plans_of_a_start_have_common_random_numbers_and_starts_do_not():
     first = rollout.states[:, 0, 0]
     share = first.bincount(minlength=10).double() / 4000
     assert p_value(first[::2] * 10 + first[1::2], (share[:, None] * share).flatten()) > FALSE_ALARM
-
-
-def test_random_numbers_are_quantiles_that_all_plans_share():
-    """Two actions with the same outcomes, of which the second is 0.2 likelier to succeed: it never does worse."""
-    probability = torch.tensor([[[0.5, 0.5], [0.3, 0.7]]]).repeat(2, 1, 1)
-    world = TabularWorld(torch.tensor([[[0, 1]] * 2] * 2), torch.tensor([0.0, 1.0]), probability=probability)
-    rewards = world.rollout(torch.zeros(9000).long(), torch.tensor([[[0], [1]]]).repeat(9000, 1, 1), seeded(0)).rewards
-    both = (rewards[:, 0] * 2 + rewards[:, 1]).long().flatten()
-    assert p_value(both, torch.tensor([0.3, 0.2, 0.0, 0.5])) > FALSE_ALARM
 
 
 @pytest.mark.parametrize("num_plans", [0, 1, 50])
@@ -193,9 +183,7 @@ def changed(*where_value):
         ({"probability": EVEN[:2]}, ["probability", "[3, 2, 2]", "[2, 2, 2]"]),
         ({"probability": TABLE}, ["probability", "int64"]),
         ({"probability": changed(1, 0, 0, 0.6)}, ["probability[1, 0]", "sum to 1", "1.1"]),
-        ({"probability": changed(1, 0, 0, -0.1)}, ["probability[1, 0, 0]", "-0.1"]),
         ({"probability": changed(2, 1, 1, torch.nan)}, ["probability[2, 1, 1]", "nan"]),
-        ({"probability": changed(2, 1, 1, torch.inf)}, ["probability[2, 1, 1]", "inf"]),
         ({"legal_actions": torch.ones(3, 2, dtype=torch.bool)}, ["legal", "probability"]),
         ({"reward": torch.rand(3, 2, 3)}, ["reward", "[W, S, A, K]", "K = 2", "[3, 2, 3]"]),
     ],
@@ -228,8 +216,3 @@ def test_a_cube_of_rewards_is_ambiguous():
 def test_reaching_a_goal_needs_a_deterministic_world():
     with refuses("deterministic"):
         can_reach(stochastic_world(0), torch.tensor([0]), 1, 3)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_conforms(kind):
-    check_world(stochastic_world(9, kind))

@@ -100,17 +100,6 @@ def test_runs_that_go_on_keep_their_own_memory():
         assert remembered.past.equal(done.plans.actions[done.plans.lengths > t, :t])
 
 
-def test_control_beats_doing_nothing():
-    """Twenty runs, all better by far: the cart is pushed to its place."""
-    world = Cart()
-    state = world.reset(20, seeded(0))
-    still = torch.tensor([0.0, 0.25]).expand(20, 1, 40, 2)
-    nothing = world.rollout(state, still).rewards.sum((1, 2))
-    for make in PLANNERS:
-        done = control(make(12, 32), world, state, 40, seeded(1))
-        assert (done.rewards.sum(1) > nothing).float().mean() > 0.9
-
-
 def test_a_plan_that_is_too_short_is_named():
     world = Cart()
     state = world.reset(2, seeded(0))

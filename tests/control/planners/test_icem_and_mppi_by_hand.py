@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from neuroprior.control import DoubleIntegrator, ICEMPlanner, MPPIPlanner, coloured_noise
+from neuroprior.control import ICEMPlanner, MPPIPlanner, coloured_noise
 from tests.support.sources import seeded
 from tests.support.vectors import Cart
 
@@ -94,44 +94,5 @@ def test_icem_decides_as_its_authors_program(first, elites, kept, monkeypatch):
         np.testing.assert_allclose(decision.plan[0], pool[0], atol=1e-6)
         np.testing.assert_allclose(decision.memory.mean[0], mean, atol=1e-6)
         mean = np.concatenate([mean[1:], mean[-1:]])
-        memory = decision.memory.moved_on(decision.plan[:, :1], world.observe(state)[:, None], planner.keep)
-        state, _ = world.step(state, decision.plan[:, 0])
-
-
-@pytest.mark.parametrize("temperature", [0.5, 20.0])
-def test_mppi_decides_as_pytorch_mppi(temperature):
-    """Where that package is installed: on the same random numbers, over several decisions."""
-    package = pytest.importorskip("pytorch_mppi")
-    world, number, std = DoubleIntegrator(), 12, 0.6
-    _, high, _, half = bounds(world)
-    sigma = torch.tensor(std * half, dtype=torch.float32)
-
-    costs = []
-
-    def moved(state, action):
-        state, reward = world.step(state, action)
-        costs.append(-reward)
-        return state
-
-    theirs = package.MPPI(
-        moved,
-        lambda state, action: costs.pop(),  # it asks after the step, with the state that this led to
-        nx=4,
-        noise_sigma=torch.diag(sigma**2),
-        num_samples=number,
-        horizon=LENGTH,
-        lambda_=temperature,
-        u_max=torch.tensor(high, dtype=torch.float32),
-        U_init=torch.zeros(LENGTH, 2),
-    )
-    planner = MPPIPlanner(LENGTH, number, std=std, temperature=temperature, normalise=False, control_cost=True)
-    state, memory = world.reset(1, seeded(10)), None
-    for decision_number in range(4):
-        decision = planner.plan(world, state, seeded(decision_number), memory)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(decision_number)
-            action = theirs.command(state[0])
-        torch.testing.assert_close(decision.plan[0, 0], action, atol=2e-5, rtol=1e-4)
-        torch.testing.assert_close(decision.plan[0], theirs.U, atol=2e-5, rtol=1e-4)
         memory = decision.memory.moved_on(decision.plan[:, :1], world.observe(state)[:, None], planner.keep)
         state, _ = world.step(state, decision.plan[:, 0])

@@ -108,26 +108,6 @@ def test_the_odds_fall_by_the_ratio_of_how_often_candidates_were_the_best(prior,
     assert shares.counts.amin() >= 0
 
 
-def share_after(decisions, quantile, num=20, share=0.5, starts=4000):
-    """The mean share where the scores of own candidates are standard normal, and the prior's as many higher."""
-    generator, found = seeded(0), None
-    for _ in range(decisions):
-        shares = Shares([num], share, starts, generator, adapt=True, wins=found)
-        score = torch.randn(starts, num, generator=generator) + quantile * shares.is_prior(0)
-        shares.observe(score)
-        found = shares.wins
-    return float(shares.counts.double().mean()) / num
-
-
-@pytest.mark.parametrize("num", [6, 20, 100])
-def test_a_prior_that_is_as_good_keeps_most_of_its_share_and_a_better_one_nearly_all(num):
-    """As stated, chance makes the share of an equally good one smaller, most of all after a single decision."""
-    assert 0.3 < share_after(2, 0.0, num) < share_after(20, 0.0, num) < 0.5
-    assert share_after(20, 0.0, num) > 0.35
-    assert share_after(20, 0.5, num) > 0.44
-    assert share_after(20, -2.0, num) < 0.15
-
-
 def test_each_start_gets_as_many_candidates_of_each_kind_as_it_should():
     shares = Shares([5], 0.6, 64, seeded(0), adapt=True, wins=wins((1.0, 300.0), (2.0, 300.0)).expand(64, 2, 2))
     (own, proposed), counts = shares.most[0], shares.counts[:, 0]

@@ -179,12 +179,9 @@ def test_the_objective_has_a_discount_and_a_value(make):
 @pytest.mark.parametrize(
     ("make", "how", "word"),
     [
-        (ShootingPlanner, {"std": 0.0}, "`std` must be finite and above 0, got 0.0"),
-        (ShootingPlanner, {"noise_beta": -1.0}, "`noise_beta` must be finite and at least 0, got -1.0"),
         (ICEMPlanner, {"elites": 0}, "elites"),
         (ICEMPlanner, {"iterations": 0}, "iterations"),
         (ICEMPlanner, {"prior_iterations": 0}, "prior_iterations"),
-        (MPPIPlanner, {"temperature": 0.0}, "temperature"),
         (MPPIPlanner, {"control_cost": True, "noise_beta": 1.0}, "`noise_beta` must be 0"),
         (MPPIPlanner, {"prior_share": 0.5}, "prior_share"),
         (MPPIPlanner, {"prior": 3}, "`prior` must be a VectorPrior, got int"),

@@ -20,7 +20,7 @@ from neuroprior.priors import MarkovPrior, load, save
 from neuroprior.testing import check_prior
 from tests.support.saved import content_of, rewrite
 from tests.support.sources import seeded
-from tests.support.vectors import Drift
+from tests.support.vectors import Drift, walks
 
 LOW, HIGH = [-1.0, -2.0], [1.0, 3.0]
 KINDS = {
@@ -244,21 +244,17 @@ PAIR = VectorPlans(torch.zeros(3, 7, 2), LOW, HIGH)
     [
         (lambda: NoisePrior("a", "b"), "`action_low` must be numbers"),
         (lambda: NoisePrior([1.0], [0.0]), "`action_low` must be below `action_high`"),
-        (lambda: NoisePrior([-1.0, -1.0], [1.0]), r"must have shape \[D\]"),
         (lambda: NoisePrior([], []), r"must have shape \[D\]"),
         (lambda: NoisePrior([-1.0], [1.0], -1.0), "`exponent` must be finite and at least 0, got -1"),
-        (lambda: NoisePrior([-1.0], [1.0], "pink"), "`exponent`"),
         (lambda: NoisePrior([-1.0], [1.0], 1.0, scale=0.0), "`scale` must be finite and above 0, got 0"),
         (lambda: AutoregressivePrior([-1.0], [1.0], 1.5), "order"),
         (lambda: AutoregressivePrior(LOW, HIGH, 7).fit(PAIR), "`order` must be below .* 7, got 7"),
         (lambda: AutoregressivePrior(LOW, HIGH, 10**7), "order"),
         (lambda: StoredWindows([-1.0], [1.0], horizon=0), "horizon"),
         (lambda: StoredWindows(LOW, HIGH, match=3, horizon=5).fit(PAIR), "`plans` must have one of 8 .* got at most 7"),
-        (lambda: VectorGRU([-1.0], [1.0], dropout="a"), "`dropout` must be at least 0 and below 1"),
         (lambda: AutoregressivePrior([-1, -1], [1, 1]).fit(PAIR), "`action_low` of the plans"),
         (lambda: AutoregressivePrior(LOW, HIGH).fit(torch.zeros(3, 4, 2)), "`plans` must be VectorPlans, got Tensor"),
         (lambda: AutoregressivePrior(LOW, HIGH).fit(PAIR.steps(7)), "`plans` must have a vector"),
-        (lambda: NoisePrior(LOW, HIGH).sample(0, 3), "num_plans"),
         (lambda: NoisePrior(LOW, HIGH).sample(2, 3, torch.zeros(1, 2)), "`context` must be None"),
         (lambda: NoisePrior(LOW, HIGH).sample(2, 3, generator=7), "generator"),
     ],
@@ -320,16 +316,6 @@ def test_shorter_plans_are_learned_from():
     forecast, _ = prior.start(1)
     assert float(forecast.mean) == pytest.approx(float(all_of_them.mean()))
     assert float(forecast.std) == pytest.approx(float(all_of_them.std(correction=0)), rel=1e-4)
-
-
-def walks(num_plans: int, length: int, size: int, seed: int) -> VectorPlans:
-    """Stationary autoregressions of order 1, of standard deviation .15."""
-    noise = torch.randn(length + 50, num_plans, size, generator=seeded(seed))
-    values = [torch.zeros(num_plans, size)]
-    for now in noise:
-        values.append(0.95 * values[-1] + (1 - 0.95**2) ** 0.5 * now)
-    bounds = [[side] * size for side in (-1.0, 1.0)]
-    return VectorPlans((0.15 * torch.stack(values[-length:], 1)).clamp(-1, 1), *bounds)
 
 
 @pytest.mark.parametrize("lengths", [[12], [40], [40, 1, 1, 2, 1]])

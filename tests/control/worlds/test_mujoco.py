@@ -15,13 +15,10 @@ gymnasium = pytest.importorskip("gymnasium")
 import mujoco  # noqa: E402
 
 from neuroprior.control import from_mujoco  # noqa: E402
+from tests.support.sources import seeded  # noqa: E402
 
 TASKS = ["HalfCheetah-v5", "Swimmer-v5", "Hopper-v5", "Walker2d-v5", "Reacher-v5", "Pusher-v5"]
 FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def world_of(task, **options):
@@ -87,7 +84,7 @@ def test_starts_have_the_distribution_of_the_environment(episodes):
     from scipy.stats import ks_2samp
 
     task, env, _ = episodes
-    ours = world_of(task).reset(500, seeded()).numpy()
+    ours = world_of(task).reset(500, seeded(0)).numpy()
     env.reset(seed=1)
     theirs = []
     for _ in range(500):
@@ -103,7 +100,7 @@ def test_starts_have_the_distribution_of_the_environment(episodes):
 
 def test_a_terminated_state_stays_and_gives_nothing():
     world = world_of("Hopper-v5")
-    start = world.reset(1, seeded())
+    start = world.reset(1, seeded(0))
     fallen = start.clone()
     fallen[:, 3] = 0.3
     plans = torch.ones(1, 1, 60, 3)
@@ -123,9 +120,9 @@ def test_a_terminated_state_stays_and_gives_nothing():
 @pytest.mark.parametrize("task", ["HalfCheetah-v5", "Pusher-v5"])
 def test_threads_change_nothing(task):
     one, two = world_of(task), from_mujoco(task, num_threads=2)
-    start = one.reset(5, seeded())
+    start = one.reset(5, seeded(0))
     plans = one.action_low + (one.action_high - one.action_low) * torch.rand(
-        5, 7, 6, one.action_size, generator=seeded()
+        5, 7, 6, one.action_size, generator=seeded(0)
     )
     assert one.rollout(start, plans).rewards.equal(two.rollout(start, plans).rewards)
 
@@ -133,8 +130,8 @@ def test_threads_change_nothing(task):
 @pytest.mark.parametrize("task", TASKS[:4])
 def test_a_goal_of_running_is_a_speed(task):
     plain, goal = world_of(task), world_of(task, goal=-1.5)
-    start = plain.reset(4, seeded())
-    action = torch.rand(4, plain.action_size, generator=seeded())
+    start = plain.reset(4, seeded(0))
+    action = torch.rand(4, plain.action_size, generator=seeded(0))
     after, reward = plain.step(start, action)
     speed = (after[:, 1] - start[:, 1]) / plain.seconds
     torch.testing.assert_close(goal.step(start, action)[1], reward - speed - (speed + 1.5).abs())
@@ -144,7 +141,7 @@ def test_a_goal_of_running_is_a_speed(task):
 def test_a_goal_of_reaching_is_a_place(task):
     world = world_of(task, goal=(0.1, -0.15))
     data = mujoco.MjData(world.model)
-    mujoco.mj_setState(world.model, data, world.reset(1, seeded())[0].numpy(), FULL)
+    mujoco.mj_setState(world.model, data, world.reset(1, seeded(0))[0].numpy(), FULL)
     mujoco.mj_kinematics(world.model, data)
     place = data.body("target" if task == "Reacher-v5" else "goal").xpos[:2]
     assert np.allclose(place, [0.1, -0.15])
@@ -156,7 +153,7 @@ def test_masses_are_a_factor_of_inertia():
     assert np.allclose(heavy.model.body_mass, 2 * light.model.body_mass)
     assert np.allclose(heavy.model.body_inertia, 2 * light.model.body_inertia)
     assert np.allclose(heavy.model.body_subtreemass, 2 * light.model.body_subtreemass)
-    start = light.reset(3, seeded())
+    start = light.reset(3, seeded(0))
     action = torch.ones(3, 2)
     assert not light.step(start, action)[0].allclose(heavy.step(start, action)[0])
 
@@ -180,7 +177,7 @@ def test_wrong_arguments(options, message):
 def test_pictures_are_drawn_or_the_reason_is_told():
     world = world_of("HalfCheetah-v5")
     try:
-        frames = world.render(world.reset(2, seeded()), 64, 48)
+        frames = world.render(world.reset(2, seeded(0)), 64, 48)
     except ValueError as error:
         if "MUJOCO_GL" not in str(error):
             raise

@@ -143,15 +143,6 @@ def test_what_is_left_beside_busy_processes_is_a_table():
     assert len(tables({"peers": rows[:1]}, {"threads": 2, "scale": 1.0})) == 1
 
 
-@pytest.mark.slow
-def test_ratios_beside_busy_processes(capsys, tmp_path):
-    arguments = ["--parts", "peers", "--jobs", "sample_markov", "--scale", "0.001", "--repetitions", "1"]
-    assert main(["bench", *arguments, "--busy", "0", "1", "--out", str(tmp_path)]) == 0
-    rows = pd.read_csv(tmp_path / "peers.csv")
-    assert sorted(rows.busy.unique()) == [0, 1]
-    assert "busy processes" in capsys.readouterr().out
-
-
 def test_the_quickest_training_that_is_close_enough_is_timed():
     chain, uniform, clock = source(), UniformPrior(4), [0.0]
     assert excess(chain, chain, chain_plans(200, 8)) == pytest.approx(1.0, abs=1e-6)
@@ -190,15 +181,6 @@ def test_gymnasium_takes_the_plans(make):
         found = list(run())
         assert found[0] > 0.9
         assert found[1] == 0
-
-
-@pytest.mark.slow
-def test_mctx_finds_the_actions_that_pay():
-    """A reward for action 2 alone, and more for whoever goes on with it."""
-    pytest.importorskip("mctx")
-    world = TabularWorld(torch.tensor([[0, 0, 1, 0], [1, 1, 1, 1]]), torch.tensor([[0.0, 1.0]]))
-    action = peers.mctx_search(world, torch.zeros(20, dtype=torch.long), UniformPrior(4), 64, 4)()
-    assert np.asarray(action).tolist().count(2) >= 15
 
 
 @pytest.mark.parametrize("prior", [UniformPrior(4), source(), GRUPrior(4, 8, lags=1)], ids=lambda p: type(p).__name__)
@@ -346,14 +328,3 @@ def test_what_is_not_installed_is_left_out():
     assert not list(against_peers("shoot", SMALL, 1, said.append, missing=lambda package: package is not None))
     assert "fit_tree: vlmc (Rust) left out, vlmc is not installed" in said
     assert "shoot: left out, minigrid is not installed" in said
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [(["--scale", "0"], "scale"), (["--jobs", "sing"], "jobs")],
-)
-def test_bad_input_is_one_line(arguments, words, capsys):
-    assert main(["bench", *arguments]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert words in error

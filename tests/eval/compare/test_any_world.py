@@ -52,7 +52,6 @@ BAD = [
     (["--world", "ring_of_forty:make_world", "--rounds", "2"], "`rounds` is not for --world"),
     (["--world", "ring_of_forty:make_world", "--planners", "halving"], "`planners` must be among"),
     (["--world", "ring_of_forty:make_world", "--seconds", "0"], "seconds"),
-    (["--length", "5"], "`length` is for --world alone"),
 ]
 
 

@@ -53,23 +53,6 @@ def test_a_small_comparison(tmp_path, capsys, monkeypatch):
     assert json.loads((out / "results.json").read_text())["rows"] == rows
 
 
-@pytest.mark.parametrize(
-    ("given", "says"),
-    [
-        (["best"], "sampling"),
-        (["mcts", "mcts"], "planners: each may be given"),
-        (["mcts", "--worlds", "grid", "slippery"], "planners: none of mcts is for slippery"),
-        (["halving", "--worlds", "grid"], "planners: none of halving is for grid"),
-    ],
-)
-def test_bad_planners_are_one_line(given, says, tmp_path, capsys):
-    assert main(["compare", "--planners", *given, "--out", str(tmp_path / "out")]) == 2
-    error = capsys.readouterr().err
-    assert says in error
-    assert len(error.splitlines()) == 1
-    assert not (tmp_path / "out").exists()
-
-
 def results(gap, seeds=4, worlds=("maze",)):
     """Samples that reach .5 to .53, and trees that reach `gap` more."""
 
@@ -100,18 +83,6 @@ def test_differences_are_paired_by_seed():
     assert first["p_holm"] == pytest.approx(2 * gap.p_value)
     assert second["difference"] == 0
     assert second["p_holm"] == 1
-
-
-def test_tables_of_a_world():
-    document = planner_document(list(results(0.2)), {}, "")
-    scores, differences = document.sections[1].tables
-    assert [row[:3] for row in scores.rows] == [["gru", "initial", "sampling"], ["gru", "initial", "mcts"]]
-    assert scores.rows[1][3].startswith("81.5 ±")
-    assert scores.rows[1][3].endswith("*") == bool(document.frames["paired"]["p_holm"][0] < 0.05)
-    assert differences.title == "maze, 16 plans: differences to sampling"
-    assert differences.rows == [["gru", "initial", "mcts", "+0.0", "+0.0 to +0.0", "1.000"]]
-    assert document.lead.startswith("Normalised scores against sampling: 1 of 2 differences are significant")
-    assert document.lead.endswith("1 positive, 0 negative.")
 
 
 def test_a_single_seed_has_no_interval():

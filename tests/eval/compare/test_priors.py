@@ -19,11 +19,11 @@ from eval.compare.priors import (
 )
 from eval.worlds.contexts import ContextIndex
 from eval.worlds.suite import TASKS
-from neuroprior import ExhaustivePlanner, GRUPrior, MarkovPrior, Plans, Prior, SamplingPlanner, collect, gridworld, save
+from neuroprior import ExhaustivePlanner, GRUPrior, MarkovPrior, Plans, Prior, collect, gridworld, save
 from neuroprior.sampling import sample_in_world
 from neuroprior.worlds import local_view, maze
 from tests.support.chains import markov_plans, markov_probs
-from tests.support.sources import FALSE_ALARM, every_plan, p_value, plan_number, refuses, seeded
+from tests.support.sources import every_plan, refuses, seeded
 
 NAMES = ("up", "right", "down")
 
@@ -173,16 +173,6 @@ def test_actions_are_matched_by_their_names(make, order, tmp_path):
         torch.testing.assert_close(Prior.forward(found, plans), found(plans))
 
 
-def test_samples_have_the_renumbered_distribution(tmp_path):
-    """A chi-square test over all plans of 3 actions; a false alarm has a probability of 1e-6."""
-    prior = MarkovPrior(3, 1)
-    found = load_for(saved(tmp_path, prior, learned()), "maze", 3, ("down", "up", "right"))
-    plans = every_plan(3, 3)
-    want = prior.log_prob(torch.tensor([2, 0, 1])[plans]).exp().double()
-    drawn = found.sample(20_000, 3, generator=seeded(0))
-    assert p_value(plan_number(drawn, 3), want) > FALSE_ALARM
-
-
 @pytest.mark.parametrize("per", ["plan", "step"])
 def test_context_goes_to_the_prior(per, tmp_path):
     shape = (40,) if per == "plan" else (40, 6)
@@ -195,19 +185,6 @@ def test_context_goes_to_the_prior(per, tmp_path):
         found.log_prob(Plans(some, found.num_actions, context=contexts)),
         prior.log_prob(Plans(torch.tensor([2, 0, 1])[some], prior.num_actions, context=contexts)),
     )
-
-
-def test_a_planner_takes_it(tmp_path):
-    names = ("left", "down", "right", "up")
-    world = gridworld(5, 5)
-    assert set(names) == set(world.action_names)
-    plans = Plans(torch.zeros(20, 4, dtype=torch.long), 4, action_names=names)  # always left
-    found = load_for(saved(tmp_path, MarkovPrior(4, 1), plans), "grid", 4, world.action_names)
-    drawn, _ = sample_in_world(found, world, world.reset(3, seeded(0)), 50, 4, generator=seeded(0))
-    left = world.action_names.index("left")
-    assert float((drawn == left).double().mean()) > 0.7
-    decision = SamplingPlanner(found, 4, 20).plan(world, world.reset(3, seeded(0)), seeded(0))
-    assert decision.plan.shape == (3, 4)
 
 
 def test_without_names_actions_are_matched_by_number(tmp_path):

@@ -344,14 +344,6 @@ def test_bits():
     # One bit per eight-fold worth: markov-2 takes 1 / 8 more, whatever the context.
     assert (gru["more"], gru["more_low"], gru["more_high"]) == pytest.approx([-1 / 8] * 3)
     assert found(made, prior="markov-2", context="none")[0]["more"] == 0
-    bits = [(1.0, 1.25), (1.5, 1.25), (1.25, 1.75), (1.0, 2.0)]
-    runs = [
-        run("maze", s, [entry("gru", curve(1), bits=own), entry("markov-1", curve(1), bits=chain)])
-        for s, (own, chain) in enumerate(bits)
-    ]
-    (row,) = found(Results(runs, ASKED).bits, prior="gru")
-    due = paired_difference(*zip(*bits, strict=True))
-    assert tuple(row[name] for name in ("more", "more_low", "more_high", "p_value")) == pytest.approx(due)
     runs = [run("maze", s, [entry("gru", curve(1), bits=1.0), entry("markov-1", curve(1))]) for s in range(3)]
     (row,) = records(Results(runs, ASKED).bits)
     assert (row["bits_per_action"], row["more"], row["p_value"], row["seeds"]) == (1.0, None, None, 3)

@@ -18,10 +18,8 @@ from eval.compare.curves import (
     best,
     curve,
     planner_of,
-    seconds_per_decision,
     tried,
 )
-from eval.compare.results import PRIOR, Results
 from eval.compare.run import Contest, Settings, compare_run, curriculum_run
 from eval.worlds.mid_plan import MidPlanWorld
 from eval.worlds.runs import Run
@@ -201,14 +199,6 @@ def test_settings_that_are_tried_score_as_in_the_curve():
     assert found["share"] == [table[number][one] for number in (4, 16)]
 
 
-def test_a_decision_is_timed_at_some_of_the_starts():
-    world = bandit(3)
-    starts = starts_of(one_step(world), world, 6, 1, seeded(0))
-    timed = seconds_per_decision(starts, UniformPrior(3), seeded(0), Sampling(), [2, 8], 2)
-    assert [(budget, steps) for budget, (_, steps) in timed.items()] == [(2, 2), (8, 8)]
-    assert all(0 < seconds < 5 for seconds, _ in timed.values())
-
-
 @pytest.fixture(scope="module")
 def run() -> dict:
     return run_in(TINY, 0, SMALL)
@@ -361,12 +351,3 @@ def test_the_documentation_describes_the_worlds():
         own = (name, task.about, task.num_actions, task.depth, lengths, contexts, task.start_factor)
         assert row == list(map(str, own))
         assert f"`{name}`" in text
-
-
-def test_tables_hold_how_candidates_were_drawn(run):
-    rows = Results([run], [4, 16]).rows
-    for one in run["entries"][1:]:
-        own = rows[[tuple(row) == (one["prior"], one["context"], one["rounds"]) for row in rows[PRIOR].to_numpy()]]
-        assert own["temperature"].tolist() == [one["temperature"]] * 2
-        assert own["uniform_share"].tolist() == [one["uniform_share"]] * 2
-    assert rows.loc[rows["prior"].isna(), "temperature"].isna().all()

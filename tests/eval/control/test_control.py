@@ -104,26 +104,6 @@ def test_nothing_is_called_significant_with_fewer_than_five_seeds():
         assert verdicts.isna().all() if seeds == 4 else (verdicts < 0.05).all()
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (["--priors", "none", "wizard"], "wizard"),
-        (["--priors", "stored"], '`priors` must have "none"'),
-        (["--scored", "none"], "scored"),
-        (["--scored", "wizard"], "wizard"),
-        (["--conditions", "validation"], "validation"),
-        (["--budgets", "8", "8"], "budgets"),
-        (["--tasks", "chess"], "chess"),
-        (["--planners", "astar"], "astar"),
-    ],
-)
-def test_bad_options_get_one_line(options, said, tmp_path, capsys):
-    assert main(["control", *options, "--out", str(tmp_path)]) == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert "Traceback" not in error
-
-
 def test_candidates_needed_by_hand():
     """Interpolated in the logarithm of the budget; the least tried where it suffices, infinite where none does."""
     budgets = np.array([8.0, 16.0, 32.0, 128.0])

@@ -7,14 +7,7 @@ from eval.control.synergies import StepSynergies
 from neuroprior.control import AutoregressivePrior, VectorPlans
 from neuroprior.testing import check_prior
 from tests.support.sources import seeded
-
-
-def walks(num, length, size, seed):
-    """Stationary autoregressions of order 1, of standard deviation .15."""
-    values = [torch.zeros(num, size)]
-    for noise in torch.randn(length + 50, num, size, generator=seeded(seed)):
-        values.append(0.95 * values[-1] + (1 - 0.95**2) ** 0.5 * noise)
-    return VectorPlans((0.15 * torch.stack(values[-length:], 1)).clamp(-1, 1), [-1.0] * size, [1.0] * size)
+from tests.support.vectors import walks
 
 
 def test_it_is_a_prior():

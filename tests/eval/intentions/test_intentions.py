@@ -192,23 +192,3 @@ def test_in_the_labyrinth(tmp_path):
     assert sorted(loss) == sorted([*kinds, *(kind for kind, _ in more)])
     assert loss["node, move"] < loss["node"]  # on the way in, or out
     assert {(row["kind"], row["minus"]) for row in results["paired"]} == set(more)
-
-
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (["--worlds", "taxi"], "worlds"),
-        (["--goals", "1"], "`goals` must be integers from 2 to 32, got 1"),
-        (["--num-plans", "1"], "`num_plans` must be integers from 2"),
-        (["--observed", "33"], "`observed` must be integers from 1 to 32"),
-        (["--ahead", "125"], "`ahead` must be integers from 1 to 124"),
-        (["--seeds", "11"], "seeds: in the labyrinth at most 10"),
-        (["--temperature", "0"], "temperature"),
-    ],
-)
-def test_bad_options_are_one_line(options, says, tmp_path, capsys):
-    assert main(["intentions", *options, "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert says in said
-    assert "Traceback" not in said
-    assert not (tmp_path / "out").exists()

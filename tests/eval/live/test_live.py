@@ -116,11 +116,8 @@ def test_what_is_reported():
     )
     due = paired_difference(own, other)
     assert (gap["difference"], gap["low"], gap["p_value"]) == pytest.approx((due.mean, due.low, due.p_value))
-    eaten, differences = document.sections[1].tables
+    eaten, _ = document.sections[1].tables
     assert [row[3].endswith("*") for row in eaten.rows] == [False, False, False, True, False, True, False, False]
-    found = {tuple(row[:4]): row[4:] for row in differences.rows}
-    assert re.match(r"\+(9\.9|10\.)", found["markov", "none", "online", "random"][0])
-    assert float(found["uniform", "none", "never", "no warm start"][-1]) > 0.05
     significant, tests = sum(gap["p_holm"] < 0.05 for gap in gaps), len(gaps)
     assert f"{significant} of {tests} differences are significant" in document.lead
 
@@ -165,25 +162,3 @@ def test_aggregates_over_worlds_are_shares_of_the_oracle():
     assert (online["worlds"], online["seeds"], online["improvement"]) == (2, 6, 1)
     assert online["first"] == pytest.approx(0.205 / 0.505, abs=0.02)
     assert online["second"] == pytest.approx(0.105 / 0.505, abs=0.02)
-
-
-@pytest.mark.parametrize(
-    ("given", "word"),
-    [
-        (["--worlds", "nowhere"], "nowhere"),
-        (["--kinds", "markov", "markov"], "kinds"),
-        (["--seeds", "0"], "seeds"),
-        (["--period", "100"], "`period` must be a multiple of 64"),
-        (["--length", "6"], "length"),
-        (["--items", "20"], "items"),
-        (["--agents", "0"], "agents"),
-        (["--processes", "0"], "processes"),
-        (["--seed", "-1"], "seed"),
-    ],
-)
-def test_bad_options(given, word, tmp_path, capsys):
-    assert main([*SMALL, *given, "--out", str(tmp_path)]) == 2
-    text = capsys.readouterr().err
-    assert text.count("\n") == 1
-    assert word in text
-    assert not list(tmp_path.iterdir())

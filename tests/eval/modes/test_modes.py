@@ -139,18 +139,3 @@ def test_a_small_run(tmp_path, capsys):
     assert (row["order"], row["modes"], row["stable"]) == (0, 1, 1)
     assert 0.85 < row["nats"] < 0.9
     assert len(list((tmp_path / "fits").rglob("*.npz"))) == FOLDS + 1
-
-
-@pytest.mark.slow
-def test_two_modes_of_the_mice_come_back(tmp_path):
-    assert main(["modes", "--modes", "2", "--orders", "1", "--restarts", "1", "--out", str(tmp_path)]) == 0
-    results = json.loads((tmp_path / "results.json").read_text())
-    assert results["rows"][0]["stable"] == 2
-    assert (tmp_path / "modes.png").read_bytes().startswith(b"\x89PNG")
-    turns = [row["mean"] for row in results["modes"] if row["what"] == "turns"]
-    assert turns[0] < 0.5 < turns[1]
-
-
-def test_a_number_twice_is_refused(tmp_path, capsys):
-    assert main(["modes", "--modes", "2", "2", "--out", str(tmp_path)]) == 2
-    assert "modes: each may be given once" in capsys.readouterr().err

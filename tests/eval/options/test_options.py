@@ -13,11 +13,10 @@ from eval.options.planner import OptionPlanner
 from eval.options.priors import entrants, pairs
 from eval.options.report import compared_pairs
 from eval.options.run import OptionSettings, index_of, numbered, observed, scores_reached
-from eval.worlds.labyrinth import DATA, cut_plans
 from eval.worlds.runs import Run
 from eval.worlds.starts import Starts
 from eval.worlds.suite import Task
-from neuroprior import ExhaustivePlanner, Plans, SamplingPlanner, TabularWorld, UniformPrior, collect, read_plans
+from neuroprior import ExhaustivePlanner, Plans, SamplingPlanner, TabularWorld, UniformPrior, collect
 from neuroprior.behaviour.analysis.comparison import score
 from neuroprior.priors import SwitchingPrior
 from neuroprior.worlds import four_rooms
@@ -151,14 +150,6 @@ def test_scores_are_the_best_of_blocks():
     assert shares == pytest.approx([0.5, 0.75, 0.9375], abs=0.05)
 
 
-def test_pieces_of_the_mice_are_consecutive():
-    plans = read_plans(DATA)
-    pieces = cut_plans(plans, 64)
-    assert pieces.actions.shape == (7 * len(plans), 64)
-    assert pieces.actions[:7].flatten().equal(plans.actions[0, :448])
-    assert pieces.context[7:14].flatten().equal(plans.context[1, :448])
-
-
 def test_only_priors_with_the_same_context_are_paired():
     rows = [
         {"world": "w", "seed": seed, "prior": prior, "context": context, "length": 8, "num_plans": 4, "share": share}
@@ -173,21 +164,3 @@ def test_only_priors_with_the_same_context_are_paired():
     assert macro["context"].tolist() == ["none"] * 2
     assert macro[["first", "second"]].to_numpy().tolist() == [[0.1, 0.3], [0.1, 0.4]]
     assert ("switching-2", "flat-2") in pairs((2,))
-
-
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (["--worlds", "taxi"], "worlds"),
-        (["--lengths", "501"], "`lengths` must be integers from 1 to 500"),
-        (["--starts", "127"], "`starts` must be integers from 1 to 126"),
-        (["--modes", "2", "2"], "modes: each may be given once"),
-        (["--num-plans", "0"], "num_plans"),
-    ],
-)
-def test_bad_options_are_one_line(options, says, tmp_path, capsys):
-    assert main(["options", *options, "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert says in said
-    assert "Traceback" not in said
-    assert not (tmp_path / "out").exists()

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from eval.options.planner import OptionPlanner
-from neuroprior import SamplingPlanner, TabularWorld, UniformPrior
+from neuroprior import TabularWorld, UniformPrior
 from neuroprior.priors import SwitchingPrior
 from neuroprior.testing import check_planner
 from tests.support.sources import FALSE_ALARM, every_plan, p_value, plan_number, refuses, seeded
@@ -71,15 +71,6 @@ def test_candidates_of_a_mode_are_drawn_from_its_exact_distribution(mode, kept):
         assert agrees == (number == mode)
 
 
-def test_together_they_are_the_mixture_with_equal_weights():
-    """Candidates by turns are not independent: their numbers vary less than multinomial ones, so the test is strict."""
-    prior = modes_of()
-    plans, _, _ = OptionPlanner(prior, 3, 30).candidates(ring(), torch.zeros(1000, dtype=torch.long), seeded(5))
-    even = torch.full((3,), 1 / 3)
-    assert p_value(plan_number(plans, 3), probabilities(prior, even, 3, False)) > FALSE_ALARM
-    assert p_value(plan_number(plans, 3), probabilities(prior, prior.first, 3, False)) < FALSE_ALARM
-
-
 def certain():
     """Mode k only takes action k, and is left for the next one with certainty."""
     prior = modes_of()
@@ -115,12 +106,6 @@ def test_uniform_plans_are_none_of_the_modes():
     plans, _, _ = planner.candidates(ring(), torch.zeros(200, dtype=torch.long), seeded(1))
     assert plans[:, :4, 0].equal((torch.arange(4) % 3).expand(200, -1).to(plans.dtype))
     assert p_value(plan_number(plans[:, 4:, :2], 3), torch.full((9,), 1 / 9)) > FALSE_ALARM
-
-
-def test_it_takes_as_many_model_steps_as_sampling():
-    world, prior = ring(), modes_of()
-    options = OptionPlanner(prior, 4, 7).plan(world, torch.arange(5), seeded(0))
-    assert options.model_steps == SamplingPlanner(prior, 4, 7).plan(world, torch.arange(5), seeded(0)).model_steps == 28
 
 
 @pytest.mark.parametrize("phases", [1, 2])

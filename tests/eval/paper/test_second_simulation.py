@@ -8,11 +8,11 @@ import torch
 from eval.paper.planners import PaperSettings
 from eval.paper.second_simulation import ceiling, empty_world, objective, pursue, random_starts
 from eval.paper.value_quality import families, quality
-from eval.paper.values import can_reach
-from neuroprior import ExhaustivePlanner, SamplingPlanner, TabularWorld, UniformPrior, collect, oracle
+from neuroprior import ExhaustivePlanner, SamplingPlanner, TabularWorld, UniformPrior, oracle
 from neuroprior.planners import value_iteration
 from neuroprior.testing import FALSE_ALARM
 from neuroprior.testing.chi_square import chi_square
+from tests.support.sources import seeded
 
 
 def settings(**changes: object) -> PaperSettings:
@@ -38,19 +38,15 @@ def settings(**changes: object) -> PaperSettings:
     return PaperSettings(**(small | changes))
 
 
-def generator(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
 @pytest.mark.parametrize(("edges", "any_prefix"), [("torus", False), ("torus", True), ("wall", True)])
 def test_exact_values_lead_every_start_that_can_to_the_goal(edges: str, any_prefix: bool) -> None:
     t = settings(edges=edges, max_plans=6, depth=4)
     world = empty_world(t, 1)
-    states = random_starts(t, 1, 200, generator())[0]
+    states = random_starts(t, 1, 200, seeded(0))[0]
     values = value_iteration(world, goal=t.goal)
     # With exact values a planner climbs to the goal, or, by parity, stays beside it.
     planner = ExhaustivePlanner(4, value=objective(values, t.goal), any_prefix=any_prefix)
-    done = pursue(planner, world, states, t.goal, t.max_plans, generator(1))
+    done = pursue(planner, world, states, t.goal, t.max_plans, seeded(1))
     able = torch.ones(200, dtype=torch.bool) if any_prefix else ceiling(world, states, t)
     assert done.reached.equal(able)
     if not any_prefix:
@@ -61,11 +57,11 @@ def test_exact_values_lead_every_start_that_can_to_the_goal(edges: str, any_pref
 def test_pursuit_goes_on_from_where_the_last_plan_ended() -> None:
     t = settings()
     world = empty_world(t, 3)
-    values = torch.rand(3, 36, generator=generator(2))
-    states = random_starts(t, 3, 60, generator()).flatten()
+    values = torch.rand(3, 36, generator=seeded(2))
+    states = random_starts(t, 3, 60, seeded(0)).flatten()
     value = objective(values, t.goal)
     planner = SamplingPlanner(UniformPrior(4), 4, 16, value=value, any_prefix=True)
-    done = pursue(planner, world, states, t.goal, 5, generator(3))
+    done = pursue(planner, world, states, t.goal, 5, seeded(3))
     now = states.clone()
     for plan, length, start in zip(done.plans, done.lengths, done.start, strict=True):
         assert int(world.cell(now[start])) != t.goal
@@ -80,14 +76,14 @@ def test_pursuit_goes_on_from_where_the_last_plan_ended() -> None:
 
 def test_pursuit_without_anything_to_do() -> None:
     t = settings()
-    done = pursue(ExhaustivePlanner(2), empty_world(t, 1), torch.tensor([t.goal]), t.goal, 3, generator())
+    done = pursue(ExhaustivePlanner(2), empty_world(t, 1), torch.tensor([t.goal]), t.goal, 3, seeded(0))
     assert done.reached.tolist() == [True]
     assert len(done.plans) == 0
 
 
 def test_starts_are_uniform_over_all_cells_but_the_goal() -> None:
     t = settings()
-    states = random_starts(t, 2, 20_000, generator())
+    states = random_starts(t, 2, 20_000, seeded(0))
     cells = (states % 36).flatten().bincount(minlength=36)
     assert int(cells[t.goal]) == 0
     assert (states // 36).equal(torch.arange(2)[:, None].expand_as(states))
@@ -110,7 +106,7 @@ def test_ceiling_by_brute_force(edges: str, depth: int) -> None:
 
 
 def random_table(seed: int) -> TabularWorld:
-    g = generator(seed)
+    g = seeded(seed)
     return TabularWorld(torch.randint(5, (5, 3), generator=g), torch.rand(2, 5, generator=g))
 
 
@@ -119,15 +115,15 @@ def random_table(seed: int) -> TabularWorld:
 def test_best_prefix_by_brute_force(goal: str, with_value: bool) -> None:
     world = random_table(1)
     state = torch.arange(10)
-    table = torch.rand(10, generator=generator(5))
+    table = torch.rand(10, generator=seeded(5))
     settings = {"objective": goal, "discount": 0.8 if goal == "return" else 1.0}
     settings |= {"value": (lambda s: table[s])} if with_value else {}
     # The best of all whole plans of every length is the best prefix.
     scores = torch.stack([ExhaustivePlanner(n, **settings).plan(world, state).score for n in (1, 2, 3, 4)])
-    found = ExhaustivePlanner(4, any_prefix=True, **settings).plan(world, state, generator())
+    found = ExhaustivePlanner(4, any_prefix=True, **settings).plan(world, state, seeded(0))
     assert torch.allclose(found.score, scores.amax(0))
     assert torch.allclose(oracle(world, state, 4, any_prefix=True, **settings), found.score)
-    sampled = SamplingPlanner(UniformPrior(3), 4, 3000, any_prefix=True, **settings).plan(world, state, generator())
+    sampled = SamplingPlanner(UniformPrior(3), 4, 3000, any_prefix=True, **settings).plan(world, state, seeded(0))
     assert torch.allclose(sampled.score, found.score), "3,000 samples of 81 plans miss the best with p < 1e-14"
     for decision in (found, sampled):
         for b in range(10):
@@ -143,36 +139,16 @@ def test_best_prefixes_are_legal_and_ties_uniform() -> None:
     legal = torch.tensor([[False, True], [True, True]])
     world = TabularWorld(torch.tensor([[0, 1], [0, 1]]), torch.ones(2), legal)
     state = torch.zeros(12_000, dtype=torch.long)
-    decision = ExhaustivePlanner(2, any_prefix=True).plan(world, state, generator())
+    decision = ExhaustivePlanner(2, any_prefix=True).plan(world, state, seeded(0))
     code = torch.where(decision.lengths == 1, 0, 1 + decision.plan[:, 1].long())
     assert bool((decision.plan[:, 0] == 1).all())
     assert chi_square(code.bincount(minlength=3).double(), torch.full((3,), 4000.0)) > FALSE_ALARM
 
 
-def test_collect_keeps_the_lengths() -> None:
-    plans = collect(ExhaustivePlanner(3, any_prefix=True), random_table(2), 50, generator=generator())
-    assert plans.lengths is not None
-    assert set(plans.lengths.tolist()) <= {1, 2, 3}
-    assert len(set(plans.lengths.tolist())) > 1
-
-
 def test_worse_values_are_of_lower_quality() -> None:
     t = settings(size=12)
     exact = value_iteration(empty_world(t, 1), goal=t.goal)[0]
-    for kind, levels in families(t, generator()).items():
+    for kind, levels in families(t, seeded(0)).items():
         found = [quality(values, exact, t.goal) for values in levels.values()]
         assert found[-1] > found[0], kind
         assert max(found) <= 1 + 1e-9
-
-
-def test_ceiling_bounds_every_start() -> None:
-    t = settings(size=8, max_plans=2, length=3)
-    world = empty_world(t, 2)
-    values = torch.rand(2, 64, generator=generator(4))
-    states = random_starts(t, 2, 300, generator())
-    for any_prefix in (False, True):
-        planner = SamplingPlanner(UniformPrior(4), 3, 64, value=objective(values, t.goal), any_prefix=any_prefix)
-        done = pursue(planner, world, states.flatten(), t.goal, 2, generator(1))
-        able = can_reach(world, states.flatten(), t.goal, 6, within=True) if any_prefix else ceiling(world, states, t)
-        assert not bool((done.reached & ~able.flatten()).any())
-        assert bool(done.reached.any())

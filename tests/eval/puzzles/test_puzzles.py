@@ -98,21 +98,3 @@ def test_levels_of_other_sizes_and_of_known_walls(tmp_path):
         assert [row["problems"] for row in found["rows"]] == [problems] * 2
         assert found["rows"][0]["solved"] == 1
         assert (found["own_walls"][0]["problems"] if own else found.get("own_walls")) == own
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--train", "nowhere.txt"], "nowhere.txt"),
-        (["--world", "chess"], "world"),
-        (["--priors", "guess"], "guess"),
-        (["--priors", "uniform", "uniform"], "uniform"),
-        (["--budget", "0"], "budget"),
-        (["--world", "tiles", "--test", "eval/data/boxoban/test.txt.xz"], "test.txt.xz"),
-    ],
-)
-def test_bad_input_is_one_line(arguments, message, capsys, tmp_path):
-    assert main(["puzzles", *arguments, "--out", str(tmp_path / "out")]) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert "Traceback" not in error

@@ -1,4 +1,4 @@
-"""`python -m eval quality` and `python -m eval plans`: sources of known entropy, and saved priors on a file."""
+"""`python -m eval quality`: sources of known entropy, text, and long sequences."""
 
 import itertools
 import json
@@ -13,8 +13,7 @@ from scipy import stats
 from eval.__main__ import main
 from eval.quality.command import LAG, LENGTH, REPEAT, _fit, _price, sources
 from eval.quality.sequences import CHARACTERS, KINDS, SWITCH, draw, sequences, switching_chain, text
-from neuroprior import ContextTreePrior, MarkovPrior, Plans, UniformPrior, save
-from neuroprior.plans import write_plans
+from neuroprior import ContextTreePrior, MarkovPrior, Plans
 from tests.support.sources import FALSE_ALARM, p_value, refuses, seeded
 
 pytestmark = pytest.mark.usefixtures("undrawn")
@@ -159,20 +158,15 @@ def test_long_sequences_have_a_table_of_their_own(tmp_path, capsys, monkeypatch)
         assert row["seconds"] > 0
         kinds = KINDS if row["entropy"] else len(CHARACTERS)
         assert (row["entropy"] or 1) < row["bits_per_action"] < math.log2(kinds)
-    said = " ".join(capsys.readouterr().out.split())
-    assert f"{rows[0]['bits_per_action']:.4f}" in said
     chain, tree, combined = rows[0], rows[1], rows[5]
     assert combined["more"] == 0
     assert chain["more"] == pytest.approx(chain["bits_per_action"] - combined["bits_per_action"])
     assert tree["more"] == pytest.approx(tree["bits_per_action"] - combined["bits_per_action"])
     assert tree["more_low"] < tree["more"] < tree["more_high"]
-    assert f"{tree['more']:+.4f} ±" in said
-    assert said.count("times as long as markov, context-tree, gru, stacked together") == 2
-    assert SOURCES[0].name in said
+    assert "times as long as markov, context-tree, gru, stacked together" in " ".join(capsys.readouterr().out.split())
     alone = tmp_path / "alone"
     assert main(["quality", "--num-plans", "0", *few, "--seeds", "3", "--out", str(alone)]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert SOURCES[0].name not in said
     again = json.loads((alone / "results.json").read_text())
     assert "rows" not in again
     assert [row["seed"] for row in again["sequences"]] == [0] * 12 + [1] * 12 + [2] * 12
@@ -183,13 +177,9 @@ def test_long_sequences_have_a_table_of_their_own(tmp_path, capsys, monkeypatch)
     gap = stats.ttest_rel(bits["context-tree"], bits["combined"])
     mean, half = (bits["context-tree"] - bits["combined"]).mean(), np.ptp(gap.confidence_interval()) / 2
     assert f"{bits['context-tree'].mean():.4f} {mean:+.4f} ±{half:.4f}" in said
-    assert said.count("95 % interval over the 3 seeds, paired") == 2
     before = len(fitted)
     assert main(["quality", "--num-plans", "0", *few, "--seeds", "2", "--out", str(alone)]) == 0
     assert len(fitted) == before  # these were learned
-    capsys.readouterr()
-    assert main(["quality", "--num-plans", "0", "--num-sequences", "0"]) == 2
-    assert "must be above 0" in capsys.readouterr().err
 
 
 def test_the_price_of_the_combined_prior_is_that_of_its_parts():
@@ -214,35 +204,3 @@ def history_at(source, actions: torch.Tensor, t: int) -> torch.Tensor:
     for back in range(source.order, 0, -1):
         code = code * source.num_actions + actions[:, t - back]
     return code
-
-
-def test_saved_priors_on_a_file(tmp_path, capsys):
-    actions = torch.arange(400).view(40, 10) % 3
-    write_plans(Plans(actions, 3, group=torch.arange(40) // 4), tmp_path / "plans.jsonl")
-    save(MarkovPrior(3, 1).fit(actions[:8]), tmp_path / "markov")
-    save(UniformPrior(3), tmp_path / "uniform")
-    folders = [str(tmp_path / "markov"), str(tmp_path / "uniform")]
-    out = tmp_path / "out"
-    assert main(["plans", str(tmp_path / "plans.jsonl"), "--priors", *folders, "--out", str(out)]) == 0
-    rows = json.loads((out / "results.json").read_text())["rows"]
-    assert [row["model"] for row in rows] == folders
-    assert rows[1]["bits_per_action"] == pytest.approx(math.log2(3))
-    assert rows[1]["more"] == pytest.approx(rows[1]["bits_per_action"] - rows[0]["bits_per_action"])
-    assert f"{rows[0]['bits_per_action']:.4f}" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("arguments", [["missing"], []])
-def test_saved_priors_that_are_not_there(arguments, tmp_path, capsys):
-    write_plans(Plans(torch.zeros(5, 3).long(), 2), tmp_path / "plans.npz")
-    more = ["--priors", *arguments]
-    assert main(["plans", str(tmp_path / "plans.npz"), "--out", str(tmp_path / "out"), *more]) == 2
-    said = capsys.readouterr().err
-    assert (arguments or ["priors"])[0] in said
-    assert said.count("\n") == 1
-
-
-def test_a_prior_for_other_actions_is_said(tmp_path, capsys):
-    write_plans(Plans(torch.full((5, 3), 7), 8), tmp_path / "plans.npz")
-    save(UniformPrior(3), tmp_path / "uniform")
-    assert main(["plans", str(tmp_path / "plans.npz"), "--priors", str(tmp_path / "uniform")]) == 2
-    assert "3" in capsys.readouterr().err

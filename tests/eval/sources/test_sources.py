@@ -100,21 +100,3 @@ def test_what_is_left_out(monkeypatch):
         "grid, seed 0: left out, no plan is better than random ones."
         " maze, seed 1: left out, too few plans were better than random ones."
     )
-
-
-@pytest.mark.parametrize(
-    ("given", "word"),
-    [
-        (["--worlds", "nowhere"], "nowhere"),
-        (["--plans", "20", "20"], "plans"),
-        (["--plans", "19"], "`plans` must be at least 20, got 19"),
-        (["--calls", "1"], "`calls` must be at least 2, got 1"),
-        (["--num-plans", "3"], "`num_plans` must be at least 4, got 3"),
-        (["--starts", "0"], "starts"),
-    ],
-)
-def test_bad_options(given, word, tmp_path, capsys):
-    assert main([*SMALL, *given, "--out", str(tmp_path)]) == 2
-    text = capsys.readouterr().err
-    assert text.count("\n") == 1
-    assert word in text

@@ -107,11 +107,6 @@ def test_studies_of_time_are_what_they_say():
     assert lasts.drug["walk"] / lasts.saline["walk"] == pytest.approx(1, rel=0.1)
 
 
-def test_bad_numbers(tmp_path, capsys):
-    assert main(["study", "--actions", "0", "--out", str(tmp_path)]) == 2
-    assert "actions" in capsys.readouterr().err
-
-
 def test_calibration_counts_what_is_missed(tmp_path, monkeypatch, capsys):
     """Small designs: shares are of all their studies."""
     small = {"8 subjects": calibration.Design(8, ratio=3.0), "hidden modes": calibration.Design(7, modes=True)}

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eval.worlds.macros import MacroPrior, learn_macros
-from neuroprior import MarkovPrior, Plans, SamplingPlanner
-from tests.support.sources import every_plan, random_world, refuses, seeded
+from neuroprior import MarkovPrior, Plans
+from tests.support.sources import every_plan, refuses, seeded
 
 
 def recoded_by_hand(plan, pair, new):
@@ -63,24 +63,6 @@ def test_macros_are_those_found_by_hand(plans):
         assert [action for symbol in predicted for action in meaning[symbol]] == plan
 
 
-def test_what_plans_repeat_is_found():
-    """Plans of three words among noise: the words are found."""
-    words = [(0, 1, 2, 3), (3, 3, 1), (2, 0, 0)]
-    generator = seeded(0)
-    plans = []
-    for _ in range(400):
-        plan = []
-        while len(plan) < 24:
-            k = int(torch.randint(5, (), generator=generator))
-            plan += words[k] if k < 3 else [int(torch.randint(4, (), generator=generator))]
-        plans.append(plan[:24])
-    macros, _ = learn_macros(Plans(torch.tensor(plans), 4), 12)
-    found = {macro.actions for macro in macros}
-    assert (0, 1, 2, 3) in found
-    assert len(found & set(words)) >= 2
-    assert macros[0].gain > 100
-
-
 def all_ways(plan, macros, actions):
     """All sequences of symbols that read as a plan, the last of them perhaps cut off."""
     meaning = [(a,) for a in range(actions)] + [macro.actions for macro in macros]
@@ -122,21 +104,6 @@ def test_probabilities_are_sums_over_all_ways(order):
 def test_before_it_learned_it_has_no_macros():
     plans = every_plan(3, 4)
     assert float(MacroPrior(3, 2, 1).log_prob(plans).exp().sum()) == pytest.approx(1, abs=1e-5)
-
-
-def test_macros_say_more_than_chains_of_the_same_order():
-    """Words of four actions: a chain of order 0 over words predicts plans better than one over actions."""
-    words = torch.tensor([[0, 1, 2, 3], [3, 2, 2, 0], [1, 1, 0, 3]])
-    plans = words[torch.randint(3, (600, 4), generator=seeded(0))].flatten(1)
-    learned, held_out = plans[:400], plans[400:]
-    macro, plain = MacroPrior(4, 12, 0).fit(learned), MarkovPrior(4, 0).fit(learned)
-    assert macro.log_prob(held_out).mean() > plain.log_prob(held_out).mean() + 5
-
-
-def test_planners_take_it():
-    world = random_world(0)
-    decision = SamplingPlanner(fitted(1), 4, 64).plan(world, world.reset(5, seeded(0)), seeded(1))
-    assert decision.plan.max() < 3
 
 
 def test_an_end_symbol_is_refused():

@@ -11,8 +11,6 @@ from hypothesis import strategies as st
 
 from neuroprior.puzzles import SlidingTilesWorld, read_tiles, sliding_tiles
 
-PUZZLES = Path(__file__).parents[3] / "eval/data/sliding_tiles/test.txt.xz"
-
 
 def distances(world: SlidingTilesWorld) -> dict[tuple[int, ...], int]:
     """The distance of each board from the goal, breadth first; the moves are written anew here."""
@@ -91,22 +89,6 @@ def test_patterns_are_those_of_plain_python() -> None:
             offset += 16 ** (height * width)
         assert codes == due
     assert world.windows.num_codes == offset
-
-
-def test_scrambles_can_be_solved_and_repeated() -> None:
-    world = sliding_tiles(shape=(3, 4), scramble=31)
-    first, again = (world.reset(50, torch.Generator().manual_seed(3)) for _ in range(2))
-    assert first.equal(again)
-    assert len(first.unique(dim=0)) > 25
-    sliding_tiles(first)  # all can be solved
-    assert (world.lower_bound(first) <= 31).all()
-
-
-def test_published_puzzles_are_read() -> None:
-    world = sliding_tiles(PUZZLES)
-    assert world.boards is not None
-    assert world.boards.shape == (1000, 5, 5)
-    assert world.boards[0, 0].tolist() == [20, 23, 0, 3, 1]
 
 
 @given(st.lists(st.permutations(range(6)), min_size=1, max_size=5), st.sampled_from([" ", "  ", "\t"]))

@@ -154,12 +154,6 @@ def test_lower_bound_is_the_cheapest_matching(world: SokobanWorld) -> None:
     assert few.lower_bound(few.boards[:0]).tolist() == []
 
 
-def test_files_hold_what_their_page_says(world: SokobanWorld) -> None:
-    assert world.boards.shape == (1000, 10, 10)
-    assert ((world.boards == 3).flatten(1).sum(1) == 4).all()
-    assert not (world.boards == 6).any()
-
-
 @given(
     st.integers(1, 5).flatmap(lambda w: st.lists(st.text("#.$*@+ ", min_size=w, max_size=w), min_size=1, max_size=5))
 )
