@@ -41,7 +41,7 @@ from neuroprior.control import (
     control,
 )
 from neuroprior.planners import FrontierPlanner, execute, oracle
-from neuroprior.priors import AdaptivePrior, CombinedPrior, MixturePrior, StackedPrior, SwitchingPrior
+from neuroprior.priors import AdaptivePrior, CombinedPrior, MixturePrior, StackedPrior, SwitchingPrior, adapt
 from neuroprior.puzzles import AStarPlanner, LevinPlanner, sliding_tiles, sokoban
 from neuroprior.sampling import sample_in_world
 from neuroprior.testing import check_prior, check_world
@@ -73,7 +73,7 @@ PRIORS: dict[str, Callable[[], Prior]] = {
     "transformer, features": lambda: TransformerPrior(A, 16, window=3, context_size=2),
     "stacked": lambda: StackedPrior(A, 8, depth=2, orders=(1,)).fit(plans(), **QUICK),
     "mixture": lambda: MixturePrior(A, [MarkovPrior(A, 1), GRUPrior(A, 8)]).fit(plans(), **QUICK),
-    "adaptive": lambda: AdaptivePrior(MarkovPrior(A, 1).fit(plans()), [3.0, 1.0], 0.9).adapted_to(plans()),
+    "adaptive": lambda: adapt(AdaptivePrior(MarkovPrior(A, 1).fit(plans()), [3.0, 1.0], 0.9), plans()),
     "combined": lambda: CombinedPrior(A, [MarkovPrior(A, 1), GRUPrior(A, 8)]).fit(plans(), **QUICK),
     "switching": lambda: SwitchingPrior(A, 2).fit(plans()),
 }

@@ -17,7 +17,8 @@ from neuroprior.behaviour.reporting import ReadOptions
 from neuroprior.behaviour.reporting.plan_report import report
 from neuroprior.cli import score as command
 from neuroprior.plans import write_plans
-from neuroprior.priors.scoring import keep_learned
+from neuroprior.priors import AdaptivePrior
+from neuroprior.priors.scoring import keep_learned, score
 from tests.support.sources import refuses, seeded
 
 
@@ -35,6 +36,25 @@ def test_ends_are_scored_but_are_no_actions(tmp_path):
     assert scores["log_likelihood"].tolist() == pytest.approx(due.tolist(), abs=1e-4)
     assert groups["actions"].tolist() == [int(lengths[k::4].sum()) for k in range(4)]
     assert groups["log_likelihood"].tolist() == pytest.approx([float(due[k::4].sum()) for k in range(4)], abs=1e-4)
+
+
+def test_subjects_go_on_from_their_earlier_files(tmp_path, capsys):
+    parts = [
+        Plans(torch.randint(3, (n, 6), generator=seeded(n)), 3, torch.arange(n) % 6 + 1, group=torch.arange(n) % 3)
+        for n in (9, 7)
+    ]
+    prior = AdaptivePrior(MarkovPrior(3, 1).fit(parts[0]), [4.0, 2.0])
+    folder, *files = (str(tmp_path / name) for name in ("prior", "before.npz", "now.npz"))
+    save(prior, folder)
+    for plans, file in zip(parts, files, strict=True):
+        write_plans(plans, file)
+    assert main(["score", folder, files[1], "--past", files[0], "--out", str(tmp_path / "out")]) == 0
+    due = score(prior, parts[1], past=parts[0])["log_likelihood"]
+    assert pd.read_csv(tmp_path / "out" / "plans.csv")["log_likelihood"].tolist() == pytest.approx(
+        due.tolist(), abs=1e-4
+    )
+    assert main(["score", folder, files[1], "--past", files[1], "--out", str(tmp_path / "out")]) == 2
+    assert "`past` must hold other files" in capsys.readouterr().err
 
 
 def scored(folder, plans, learned=(), **options):

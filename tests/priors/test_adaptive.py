@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from neuroprior import ContextTreePrior, GRUPrior, MarkovPrior, Plans, UniformPrior, fit, load, save
-from neuroprior.priors import AdaptivePrior
+from neuroprior.priors import AdaptivePrior, MixturePrior, adapt
 from neuroprior.priors.adaptive import likeliest_concentrations
 from neuroprior.testing import check_prior
 from tests.support.sources import refuses, seeded
@@ -168,30 +168,42 @@ def test_earlier_sequences_are_handed_on(tmp_path):
     urn = AdaptivePrior(UniformPrior(3), [2.0])
     first, second = torch.tensor([[0, 1, 1, 0, 0]]), torch.tensor([[1, 0, 2]])
     together = urn.log_prob(torch.cat([first, second], 1)) - urn.log_prob(first)
-    assert urn.adapted_to(first).log_prob(second).allclose(together)
+    assert adapt(urn, first).log_prob(second).allclose(together)
     # What was handed on fades as the sequence goes on.
-    fading = AdaptivePrior(UniformPrior(3), [2.0], 0.5).adapted_to(first)
+    fading = adapt(AdaptivePrior(UniformPrior(3), [2.0], 0.5), first)
     due = [(3 + 2 / 3) / 7, (3 / 2 + 1 + 2 / 3) / (5 / 2 + 1 + 2), (2 / 4 + 2 / 3) / (5 / 4 + 3 / 2 + 2)]
     assert fading.action_log_probs(torch.tensor([[0, 0, 1]])).exp()[0].tolist() == pytest.approx(due)
     # Nothing is known of what followed two actions before there are two.
-    late = AdaptivePrior(UniformPrior(3), [inf, inf, 0.1]).adapted_to(torch.tensor([[0, 0, 2]]))
+    late = adapt(AdaptivePrior(UniformPrior(3), [inf, inf, 0.1]), torch.tensor([[0, 0, 2]]))
     probs = late.action_log_probs(torch.tensor([[2, 0, 0, 2]])).exp()[0].tolist()
     assert probs == pytest.approx([1 / 3, 1 / 3, 1 / 3, (1 + 0.1 / 3) / 1.1])
     # Histories of two actions, in plans of unequal lengths; padding says nothing.
     prior = AdaptivePrior(MarkovPrior(3, 1).fit(SKEWED), [inf, 2.0, 0.5], 0.5)
     some = Plans(torch.tensor([[0, 1, 2, 1], [1, 2, 2, 2], [0, 0, 0, 0]]), 3, torch.tensor([4, 3, 1]))
-    adapted = prior.adapted_to(some[:1]).adapted_to(some[1:])
+    adapted = adapt(adapt(prior, some[:1]), some[1:])
     assert adapted.earlier_1.tolist() == [[0, 1, 0], [0, 0, 2], [0, 1, 1]]
     assert adapted.earlier_2[1 * 3 + 2].tolist() == [0, 1, 1]
     assert adapted.earlier_2.sum() == 3
     check_prior(adapted)
     for name in ("earlier_0", "earlier_1", "earlier_2"):
-        assert getattr(adapted, name).equal(getattr(prior.adapted_to(some), name))
+        assert getattr(adapted, name).equal(getattr(adapt(prior, some), name))
         assert len(getattr(prior, name)) == 0
     again = load(save(adapted, tmp_path))
     new = torch.tensor([[1, 2, 1, 2, 0]])
     assert again.log_prob(new).equal(adapted.log_prob(new))
     assert not adapted.log_prob(new).allclose(prior.log_prob(new))
+
+
+def test_experts_of_an_ensemble_begin_with_what_was_counted():
+    """Each follows the individual, and the mixture with them; what counts nothing stays as it was."""
+    chain, urn = MarkovPrior(3, 1).fit(SKEWED), AdaptivePrior(UniformPrior(3), [2.0])
+    mixture = MixturePrior(3, [chain, urn])
+    some, new = Plans(torch.tensor([[0, 2, 2, 1], [2, 0, 1, 1]]), 3, torch.tensor([4, 1])), torch.tensor([[2, 2, 1]])
+    due = MixturePrior(3, [chain, adapt(urn, some)])
+    assert adapt(mixture, some).log_prob(new).allclose(due.log_prob(new))
+    assert not due.log_prob(new).allclose(mixture.log_prob(new))
+    with refuses("`prior` must learn along a sequence", "MarkovPrior does not"):
+        adapt(chain, some)
 
 
 def test_it_is_known_by_name():
@@ -213,7 +225,7 @@ def test_wrong_arguments_are_refused(arguments, words):
     with refuses(*words):
         AdaptivePrior(UniformPrior(3), *arguments)
     with refuses("`plans` must have 3 actions", "got 4"):
-        AdaptivePrior(UniformPrior(3)).adapted_to(Plans(torch.zeros(1, 2, dtype=torch.long), 4))
+        adapt(AdaptivePrior(UniformPrior(3)), Plans(torch.zeros(1, 2, dtype=torch.long), 4))
 
 
 @pytest.mark.parametrize("decay", [1.0, 0.7])
@@ -234,5 +246,5 @@ def test_counts_of_an_individual_go_on_from_plan_to_plan(decay):
         earlier = [
             other for other in range(number) if plans.group[other] == plans.group[number] and plans.lengths[other]
         ]
-        now = prior.adapted_to(plans[torch.tensor(earlier)]) if earlier else prior
+        now = adapt(prior, plans[torch.tensor(earlier)]) if earlier else prior
         assert found[number].allclose(now.action_log_probs(plans[number : number + 1])[0], atol=1e-5)

@@ -1,5 +1,6 @@
 """Plans scored under a prior, as a table; plans that the prior has learned from are known again."""
 
+from dataclasses import replace
 from math import log
 
 import pytest
@@ -7,7 +8,7 @@ import torch
 
 from neuroprior import MarkovPrior, Plans, UniformPrior, save
 from neuroprior.behaviour.recorded_plans import RecordedPlans
-from neuroprior.priors import match_plans
+from neuroprior.priors import AdaptivePrior, adapt, match_plans
 from neuroprior.priors.scoring import keep_learned, learned_from, score
 from tests.support.sources import refuses, seeded
 
@@ -64,6 +65,40 @@ def test_sums_are_those_of_the_plans(by):
     assert frame["log_likelihood"].tolist() == pytest.approx(sums)
     bits = [-total / log(2) / row[2] if row[2] else float("nan") for total, row in zip(sums, rows, strict=True)]
     assert frame["bits_per_action"].tolist() == pytest.approx(bits, nan_ok=True)
+
+
+def test_groups_go_on_from_their_earlier_plans():
+    """Each by name from its own, whatever their numbers; one without earlier plans is scored alone."""
+    prior = AdaptivePrior(PRIOR, [3.0, 1.5])
+    plans = replace(NEW, lengths=torch.tensor([3, 2, 2]), group=torch.tensor([0, 2, 1]), group_names=("m1", "m2", "m3"))
+    actions = torch.tensor([[0, 0, 2, 1], [1, 1, 2, 0], [2, 2, 2, 2]])
+    past = Plans(
+        actions, 3, torch.tensor([4, 3, 1]), action_names=NAMES, group=torch.tensor([1, 0, 1]), group_names=("m3", "m1")
+    )
+    with torch.no_grad():
+        due = [
+            float(own.log_prob(torch.tensor([plan])))
+            for own, plan in (
+                (adapt(prior, past[torch.tensor([0, 2])]), [1, 2, 2]),
+                (adapt(prior, past[1:2]), [2, 1]),
+                (prior, [1, 1]),
+            )
+        ]
+    assert score(prior, plans, past=past)["log_likelihood"].tolist() == pytest.approx(due, abs=1e-5)
+    assert score(prior, plans)["log_likelihood"].tolist() != pytest.approx(due, abs=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("prior", "past", "words"),
+    [
+        (AdaptivePrior(PRIOR), replace(NEW, group=None, group_names=None), "`past` must have groups"),
+        (AdaptivePrior(PRIOR), replace(NEW, group_names=("m8", "m9")), "`past` must hold plans of a group of `plans`"),
+        (PRIOR, NEW, "`prior` must learn along a sequence"),
+    ],
+)
+def test_a_past_of_others_is_refused(prior, past, words):
+    with refuses(words):
+        score(prior, NEW, past=past)
 
 
 def test_other_numbers_are_never_taken_for_the_same():

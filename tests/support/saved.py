@@ -16,7 +16,15 @@ from neuroprior.behaviour.durations.duration_model import DurationModel
 from neuroprior.behaviour.durations.semi_markov import SemiMarkovPrior
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.control import AutoregressivePrior, NoisePrior, StoredWindows, VectorGRU, VectorPlans
-from neuroprior.priors import AdaptivePrior, ContextTreePrior, MixturePrior, StackedPrior, SwitchingPrior, serialization
+from neuroprior.priors import (
+    AdaptivePrior,
+    ContextTreePrior,
+    MixturePrior,
+    StackedPrior,
+    SwitchingPrior,
+    adapt,
+    serialization,
+)
 from neuroprior.priors.saved import SavedModule
 from neuroprior.puzzles import LogLinearPrior
 from tests.support.sources import seeded
@@ -63,7 +71,7 @@ SAVED: dict[str, Callable[[], SavedModule]] = {
     "markov, index": lambda: MarkovPrior(3, 2, num_contexts=4, initial="lower").fit(_plans(_index())),
     "context tree": lambda: ContextTreePrior(3, 3, num_contexts=4).fit(_plans(_index())),
     "context tree that knows zeros": lambda: ContextTreePrior(3, alpha=1e-300).fit(torch.zeros(9, 5, dtype=torch.long)),
-    "adaptive": lambda: AdaptivePrior(MarkovPrior(3, 1), [4.0, inf, 0.5], 0.8).fit(_plans()).adapted_to(_plans()),
+    "adaptive": lambda: adapt(AdaptivePrior(MarkovPrior(3, 1), [4.0, inf, 0.5], 0.8).fit(_plans()), _plans()),
     "mixture": lambda: MixturePrior(3, [UniformPrior(3), MixturePrior(3, [MarkovPrior(3, 1)])]).fit(
         _plans(), generator=seeded(0)
     ),

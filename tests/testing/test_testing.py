@@ -27,7 +27,7 @@ from neuroprior import (
 )
 from neuroprior.behaviour import RecordedPlans, SemiMarkovPrior
 from neuroprior.control import NoisePrior
-from neuroprior.priors import AdaptivePrior
+from neuroprior.priors import AdaptivePrior, adapt
 from neuroprior.puzzles import LogLinearPrior, sliding_tiles, sokoban
 from neuroprior.sampling.states import tensors_in
 from neuroprior.testing import check_prior, check_world
@@ -88,9 +88,10 @@ PRIORS = {
         random_plans(3, index_context(60, 5))
     ),
     "adaptive": lambda: AdaptivePrior(MarkovPrior(3, 1), [4.0, 2.0, 0.5], 0.8).fit(random_plans(3)),
-    "adaptive, of an individual": lambda: AdaptivePrior(
-        ContextTreePrior(3, 2, num_contexts=4).fit(random_plans(3, index_context(60, 5))), [3.0, 1.0]
-    ).adapted_to(random_plans(3, index_context(60, 5))),
+    "adaptive, of an individual": lambda: adapt(
+        AdaptivePrior(ContextTreePrior(3, 2, num_contexts=4).fit(random_plans(3, index_context(60, 5))), [3.0, 1.0]),
+        random_plans(3, index_context(60, 5)),
+    ),
     "log-linear untrained": lambda: LogLinearPrior(4, 2),
     "log-linear": lambda: LogLinearPrior(3, 2).fit(random_plans(3, pattern_context(60, 5))),
     "gru untrained": lambda: GRUPrior(4),

@@ -9,7 +9,7 @@ import torch
 from neuroprior import MarkovPrior
 from neuroprior.behaviour import RecordedPlans, individuality
 from neuroprior.plans.folds import folds
-from neuroprior.priors import AdaptivePrior
+from neuroprior.priors import AdaptivePrior, adapt
 from tests.support.sources import refuses, seeded
 
 NAMES = ("eat", "groom", "rest")
@@ -40,7 +40,7 @@ def test_what_is_saved_is_that_of_priors_that_have_not_met_the_subject():
         prior = AdaptivePrior(MarkovPrior(3, 1), [10.0, 10.0]).fit(plans[rest])
         for group in plans.group[held_out].unique().tolist():
             first, second = (plans[[number]] for number in (plans.group == group).nonzero()[:, 0].tolist())
-            adapted = prior.log_prob(first) + prior.adapted_to(first).log_prob(second)
+            adapted = prior.log_prob(first) + adapt(prior, first).log_prob(second)
             due[group] += float(adapted - prior.base.log_prob(first) - prior.base.log_prob(second)) / log(2)
     frame = result.frame()
     assert (frame["saved"] * frame["bouts"]).to_numpy() == pytest.approx(list(due.values()), abs=1e-3)
