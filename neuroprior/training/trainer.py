@@ -67,7 +67,7 @@ def train(
             the training diverged.
         KeyboardInterrupt: Ctrl-C.
     """
-    device = next(prior.parameters()).device
+    device, plans = next(prior.parameters()).device, plans.trimmed()  # padding decides no batches and windows
     training: Sequences
     validation: Sequences
     in_windows = hasattr(prior, "forward_from") or hasattr(prior, "log_probs_from")

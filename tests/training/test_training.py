@@ -331,3 +331,14 @@ def test_past_the_training_length(make):
             anew = test.unfold(1, 12, 1)[:, 1:]
             logits = torch.cat([prior(some.flatten(0, 1))[:, -1] for some in anew.split(64)])
         assert float((carried - bits_of(logits.view(*anew.shape[:2], 4), test[:, 12:])).mean()) < 0.001
+
+
+def test_padding_changes_nothing():
+    """Batches and windows follow from the longest plan, however wide the tensor is that holds it."""
+    lengths = torch.arange(1, 61)
+    plans = Plans(torch.randint(3, (60, 60), generator=seeded(1)), 3, lengths)
+    wide = Plans(torch.nn.functional.pad(plans.actions, (0, 3000), value=2), 3, lengths)
+    first, second = GRUPrior(3, 4, seed=2), GRUPrior(3, 4, seed=2)
+    curves = [train(prior, some, how(9, check_every=3), 5) for prior, some in ((first, plans), (second, wide))]
+    assert [one["validation_bits"] for one in curves[0]] == [one["validation_bits"] for one in curves[1]]
+    assert first.log_prob(plans).equal(second.log_prob(plans))
