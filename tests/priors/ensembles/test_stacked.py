@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from neuroprior import MarkovPrior, Plans, load, save
-from neuroprior.behaviour.analysis.comparison import score
 from neuroprior.priors import StackedPrior
 from neuroprior.priors.ensembles.stacked import LONG_AGO
 from neuroprior.testing import check_prior
@@ -88,50 +87,6 @@ def test_in_the_end_the_experts_learn_from_all_plans():
     chain, *_ = fitted(plans, False).experts
     again = MarkovPrior(A, 1, 4.0, backoff="witten-bell").fit(own)
     assert chain.log_prob(own).equal(again.log_prob(own))
-
-
-def memories(num: int, seed: int) -> Plans:
-    """In one of four rooms, visited at random, an action is never the one that was last taken in this room."""
-    generator = seeded(seed)
-    context = torch.randint(C, (num, 60), generator=generator)
-    shift = torch.randint(1, A, (num, 60), generator=generator)
-    last = torch.randint(A, (num, C), generator=generator)
-    actions = torch.zeros(num, 60, dtype=torch.long)
-    row = torch.arange(num)
-    for t in range(60):
-        actions[:, t] = (last[row, context[:, t]] + shift[:, t]) % A
-        last[row, context[:, t]] = actions[:, t]
-    return Plans(actions, A, context=context)
-
-
-def test_it_learns_what_counts_cannot_hold():
-    """One bit is what an action holds, two choices; a chain of any order knows little of it."""
-    training, held_out = memories(200, 0), memories(100, 1)
-    stacked = StackedPrior(A, 32, 0.1, (1, 2), 3, num_contexts=C)
-    stacked.fit(training, generator=seeded(0), max_steps=100, learning_rate=0.02, progress=False)
-    mine = score("stacked", stacked, held_out).bits_per_action().mean
-    chains = [MarkovPrior(A, order, num_contexts=C).fit(training) for order in range(4)]
-    best = min(score("chain", chain, held_out).bits_per_action().mean for chain in chains)
-    assert 1 < mine < 1.3  # 1 and what first visits of a room cost beyond
-    assert best > 1.4
-
-
-def test_it_is_saved_and_loaded(tmp_path):
-    plans = some_plans()
-    prior = fitted(plans, True)
-    again = load(save(prior, tmp_path / "stacked"))
-    assert again.log_prob(plans).equal(prior.log_prob(plans))
-    assert again.config == prior.config
-    same = fitted(plans, True)
-    assert all(a.equal(b) for a, b in zip(prior.state_dict().values(), same.state_dict().values(), strict=True))
-
-
-def test_long_plans_and_a_single_one():
-    """Past the training window the hidden state is carried on; a single plan is cut in parts."""
-    one = Plans(torch.randint(A, (1, 300), generator=seeded(3)), A)
-    prior = fitted(one, False, window=16)
-    assert prior.action_log_probs(one).shape == (1, 300)
-    assert prior.mixer.window is None
 
 
 @pytest.mark.parametrize(
