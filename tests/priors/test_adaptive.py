@@ -194,13 +194,6 @@ def test_earlier_sequences_are_handed_on(tmp_path):
     assert not adapted.log_prob(new).allclose(prior.log_prob(new))
 
 
-def test_it_is_known_by_name():
-    learned, _ = individuals(20, 80, 2.0, 5)
-    prior = fit(learned, "adaptive")
-    assert isinstance(prior.base, ContextTreePrior)
-    assert prior.concentrations[1] < inf
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
