@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import torch
 
-from neuroprior import CombinedPrior, MarkovPrior, Plans, UniformPrior
+from neuroprior import CombinedPrior, MarkovPrior, Plans, Prior, UniformPrior
 from neuroprior.priors import MixturePrior, StackedPrior
 from neuroprior.priors.counts import BACKOFFS_TRIED, Chains, HistoryPrior
 from neuroprior.priors.ensembles import stacked
@@ -210,6 +210,28 @@ def test_no_other_share_is_likelier(seed):
     for share in SHARES:
         mixture.share = share
         assert float(mixture.log_prob(plans).sum()) <= best + 1e-4
+
+
+def alternating(num: int = 30, length: int = 5) -> tuple[list[Prior], Plans]:
+    """Two experts, and plans of which a third are the one's and two thirds the other's."""
+    one, two = [0.7, 0.2, 0.1], [0.1, 0.2, 0.7]
+    actions = torch.cat([drawn(one, num, length, 1), drawn(two, 2 * num, length, 2)])
+    return [independent(one), independent(two)], Plans(actions, A)
+
+
+def test_weights_of_whole_plans_do_not_depend_on_what_is_beyond_their_ends():
+    """Where each plan is one expert's: what pads the plans is the other's."""
+    experts, plans = alternating(8, 16)
+    lengths, found = torch.arange(24) % 4 + 13, []
+    for padding in range(A):
+        beyond = torch.arange(40) >= lengths[:, None]
+        actions = torch.nn.functional.pad(plans.actions, (0, 24)).masked_fill(beyond, padding)
+        mixture = MixturePrior(A, experts)
+        mixture.learn_weights(Plans(actions, A, lengths))
+        found.append((mixture.share, mixture.first.tolist()))
+    for share, first in found:
+        assert share == 0
+        assert first == pytest.approx(found[0][1], abs=1e-5)
 
 
 @pytest.mark.parametrize("given", [{}, {"batch_size": 16}, {"learning_rate": 1e-3, "max_steps": 5}])
