@@ -108,7 +108,8 @@ def test_the_last_action_of_a_plan_has_no_next_one():
 
 
 def test_a_model_is_loaded_as_what_it_is(tmp_path):
-    save(DurationModel(3, ["gamma", "weibull"]).fit(transitions()), tmp_path)
+    model = DurationModel(3, ["gamma", "weibull"]).fit(transitions())
+    assert repr(load(save(model, tmp_path), kind=DurationModel)) == repr(model)
     with refuses("DurationModel", "must hold a Prior", "kind=DurationModel"):
         load(tmp_path)
     save(MarkovPrior(3), tmp_path)

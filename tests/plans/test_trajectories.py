@@ -6,6 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from neuroprior import Plans
 from neuroprior.control import VectorPlans
@@ -73,6 +75,13 @@ def test_there_and_back(context):
     assert [trajectory["actions"].tolist() for trajectory in trajectories] == [[0, 2, 1], [1]]
     assert all(("observations" in trajectory) == (context is not None) for trajectory in trajectories)
     same(from_trajectories(trajectories, 3), plans)
+
+
+@settings(derandomize=True, deadline=None)
+@given(rows=st.lists(st.lists(st.integers(0, 4), max_size=5), min_size=1, max_size=5))
+def test_any_actions_there_and_back(rows):
+    plans = from_trajectories([{"actions": row} for row in rows], 5)
+    assert [trajectory["actions"].tolist() for trajectory in to_trajectories(plans)] == rows
 
 
 @pytest.mark.parametrize(

@@ -270,6 +270,8 @@ def test_validation_plans_stop_a_training_and_nothing_is_learned_from_them(name)
     zeros, ones = (Plans(torch.full((20, 6), action), 3) for action in (0, 1))
     first, last = (fitted(zeros, validation, check_every=2, max_steps=40) for validation in (ones, zeros))
     assert bits(first, zeros) > bits(last, zeros) + 0.002
+    with refuses("no validation plan has an action"):
+        fitted(named, Plans(named.actions, 3, lengths=torch.zeros(30, dtype=torch.long)))
 
 
 @pytest.mark.slow

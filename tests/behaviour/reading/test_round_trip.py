@@ -82,9 +82,6 @@ def write(frame: pd.DataFrame, folder: str, separator: str, encoding: str, comma
     return str(path)
 
 
-File = tuple[str, str, bool, str]
-"""Its separator and encoding, whether numbers have a decimal comma, and how it is packed."""
-
 FILES = st.tuples(
     st.sampled_from([",", ";", "\t", "|"]),
     st.sampled_from(["utf-8", "utf-8-sig", "utf-16", "cp1252"]),
@@ -104,7 +101,7 @@ def same_events(found: pd.DataFrame, study: pd.DataFrame, times: bool = True) ->
         )
 
 
-def read_back(frame: pd.DataFrame, file: File, **options: Any) -> pd.DataFrame:
+def read_back(frame: pd.DataFrame, file: tuple[str, str, bool, str], **options: Any) -> pd.DataFrame:
     separator, encoding, comma, packed = file
     with tempfile.TemporaryDirectory() as folder:
         path = write(frame, folder, separator, encoding, comma and separator != ",", packed)
@@ -115,7 +112,9 @@ def read_back(frame: pd.DataFrame, file: File, **options: Any) -> pd.DataFrame:
 @given(
     study=studies(), file=FILES, words=st.sampled_from(VOCABULARIES), ends=st.sampled_from(["stop", "duration", "both"])
 )
-def test_rows_of_events(study: pd.DataFrame, file: File, words: dict[str, str], ends: str) -> None:
+def test_rows_of_events(
+    study: pd.DataFrame, file: tuple[str, str, bool, str], words: dict[str, str], ends: str
+) -> None:
     table = study.assign(duration=study["stop"] - study["start"])
     table = table.drop(columns={"stop": ["duration"], "duration": ["stop"], "both": []}[ends]).rename(columns=words)
     same_events(read_back(table, file, ends="exclusive"), study)
@@ -123,7 +122,9 @@ def test_rows_of_events(study: pd.DataFrame, file: File, words: dict[str, str], 
 
 @settings(max_examples=EXAMPLES, deadline=None)
 @given(study=studies(), file=FILES, pair=st.sampled_from(EVENT_WORDS), order=st.sampled_from(["time", "behaviour"]))
-def test_rows_of_starts_and_stops(study: pd.DataFrame, file: File, pair: tuple[str, str], order: str) -> None:
+def test_rows_of_starts_and_stops(
+    study: pd.DataFrame, file: tuple[str, str, bool, str], pair: tuple[str, str], order: str
+) -> None:
     begin = study.drop(columns="stop").rename(columns={"start": "time"}).assign(type=pair[0])
     end = study.drop(columns="start").rename(columns={"stop": "time"}).assign(type=pair[1])
     table = pd.concat([begin, end]).sort_values(
@@ -134,7 +135,9 @@ def test_rows_of_starts_and_stops(study: pd.DataFrame, file: File, pair: tuple[s
 
 @settings(max_examples=EXAMPLES, deadline=None)
 @given(study=studies(), file=FILES, words=st.sampled_from(VOCABULARIES))
-def test_rows_of_frames_and_columns_of_behaviours(study: pd.DataFrame, file: File, words: dict[str, str]) -> None:
+def test_rows_of_frames_and_columns_of_behaviours(
+    study: pd.DataFrame, file: tuple[str, str, bool, str], words: dict[str, str]
+) -> None:
     parts = []
     for (recording, subject), one in study.groupby(["recording", "subject"], sort=False):
         frame = np.arange(round(one["stop"].max() * 10))
@@ -158,7 +161,7 @@ def test_rows_of_frames_and_columns_of_behaviours(study: pd.DataFrame, file: Fil
 
 @settings(max_examples=EXAMPLES, deadline=None)
 @given(study=studies(), file=FILES, header=st.sampled_from(["action_{}", "t{}", "{}", "Jan.{:02d}"]))
-def test_rows_of_sequences(study: pd.DataFrame, file: File, header: str) -> None:
+def test_rows_of_sequences(study: pd.DataFrame, file: tuple[str, str, bool, str], header: str) -> None:
     rows = [[subject, *one["behaviour"]] for subject, one in study.groupby("subject", sort=False)]
     width = max(map(len, rows))
     names = ["id", *(header.format(i + 1) for i in range(width - 1))]
@@ -174,7 +177,7 @@ def test_rows_of_sequences(study: pd.DataFrame, file: File, header: str) -> None
 
 @settings(max_examples=EXAMPLES, deadline=None)
 @given(study=studies(), file=FILES)
-def test_strings_of_sequences(study: pd.DataFrame, file: File) -> None:
+def test_strings_of_sequences(study: pd.DataFrame, file: tuple[str, str, bool, str]) -> None:
     study = study.assign(behaviour=study["behaviour"].str.replace("[^A-Za-z]", "", regex=True))
     whole = study.assign(length=((study["stop"] - study["start"]) * 10).round().astype(int))
     strings = whole.groupby("subject", sort=False).apply(
@@ -188,7 +191,7 @@ def test_strings_of_sequences(study: pd.DataFrame, file: File) -> None:
 @settings(max_examples=EXAMPLES, deadline=None)
 @given(study=studies(), file=FILES, seed=st.integers(0, 99), extra=st.booleans())
 def test_the_order_of_rows_other_columns_and_units_change_nothing(
-    study: pd.DataFrame, file: File, seed: int, extra: bool
+    study: pd.DataFrame, file: tuple[str, str, bool, str], seed: int, extra: bool
 ) -> None:
     table = study.sample(frac=1, random_state=seed)
     table = table.assign(comment="nothing odd", number=np.arange(len(table)) % 3) if extra else table
@@ -204,7 +207,9 @@ def test_the_order_of_rows_other_columns_and_units_change_nothing(
 
 @settings(max_examples=EXAMPLES, deadline=None)
 @given(study=studies(), cut=st.integers(1, 200), file=FILES)
-def test_a_file_that_is_cut_off_gives_no_other_events_silently(study: pd.DataFrame, cut: int, file: File) -> None:
+def test_a_file_that_is_cut_off_gives_no_other_events_silently(
+    study: pd.DataFrame, cut: int, file: tuple[str, str, bool, str]
+) -> None:
     separator, encoding, comma, _ = file
     with tempfile.TemporaryDirectory() as folder:
         path = Path(write(study, folder, separator, encoding, comma and separator != ",", ""))

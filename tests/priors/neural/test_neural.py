@@ -88,6 +88,13 @@ def test_fit_sets_the_window_to_the_longest_plan_unless_it_is_given(kind):
 
 
 @BOTH
+@pytest.mark.parametrize("shape", [(1, 1), (0, 4), (9, 0)])
+def test_refuses_too_few_plans(kind, shape):
+    with refuses("plans"):
+        small(kind).fit(torch.zeros(shape, dtype=torch.long), **QUICK)
+
+
+@BOTH
 def test_a_single_group_is_no_group(kind):
     """Plans of one animal are held out as if they had no group."""
     actions = torch.randint(3, (9, 4), generator=seeded(3))
