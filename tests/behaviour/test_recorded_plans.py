@@ -75,7 +75,7 @@ def test_an_end_symbol_takes_no_time_and_comes_off_again():
     opened = closed.without_end()
     assert told(opened.durations) == told(PLANS.durations)
     assert told(opened.began) == told(PLANS.began)
-    assert opened.recording == PLANS.recording
+    assert closed.recording == opened.recording == PLANS.recording
 
 
 def test_plain_plans_are_recorded_plans_without_times():
@@ -127,7 +127,12 @@ def test_npz_files_hold_everything_and_others_refuse_it(tmp_path):
         ({"condition": torch.tensor([0, 1])}, "`condition` must have shape [3], got [2]"),
         ({"condition_names": ("a",)}, "`condition_names` must come with the integers in condition"),
         ({"condition": torch.tensor([0, 2, 0]), "condition_names": ("a", "b")}, "condition[1]: 2"),
+        ({"condition": torch.tensor([0.5, 1, 1])}, "condition"),
         ({"notes": "x"}, "`notes` must be a list of texts"),
+        ({"recording": ["a", "b"]}, "`recording` must be 3 names, one a plan, got 2"),
+        ({"recording": "abc"}, "`recording` must be a list of texts"),
+        ({"recording": ["a", "b", "\ud83d"]}, "surrogate"),
+        ({"cut_off": torch.zeros(3, 3, dtype=torch.bool)}, "`cut_off` must be bool, of plans with durations"),
     ],
 )
 def test_what_is_refused(fields, words):
@@ -146,40 +151,10 @@ def test_durations_are_times_where_there_are_actions(wrong):
         RecordedPlans(actions, 1, torch.tensor([2, 3]), durations=durations)
 
 
-def test_plans_keep_their_names():
-    plans = RecordedPlans(torch.arange(6).view(3, 2), 6, recording=["a", "b", "a"])
-    assert plans.recording == ("a", "b", "a")
-    assert plans[1:].recording == ("b", "a")
-    assert plans[torch.tensor([2, 1])].recording == ("a", "b")
-    assert plans[torch.tensor([True, False, True])].recording == ("a", "a")
-    assert plans.with_end().recording == plans.steps(1).recording == plans.recording
+def test_parts_of_a_split_have_what_belongs_to_them():
+    plans = RecordedPlans(torch.arange(6).view(3, 2), 6, recording=["a", "b", "a"], durations=torch.ones(3, 2))
     for part in plans.split(0.4, torch.Generator().manual_seed(0)):
         assert [("a", "b", "a")[int(first) // 2] for first in part.actions[:, 0]] == list(part.recording)
-    for wrong, words in (
-        (["a", "b"], "`recording` must be 3 names, one a plan, got 2"),
-        ("abc", "`recording` must be a list of texts"),
-        (["a", "b", "\ud83d"], ".*surrogate"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            RecordedPlans(plans.actions, 6, recording=wrong)
-
-
-def test_durations_and_conditions_stay_with_their_plans():
-    times, condition = torch.tensor([[1.0, 2], [3, 9]]), torch.tensor([0, 1])
-    plans = RecordedPlans(torch.tensor([[0, 1], [1, 0]]), 2, torch.tensor([2, 1]), durations=times, condition=condition)
-    assert plans.durations.tolist() == [[1, 2], [3, 0]]
-    assert plans[1:].durations.tolist() == [[3, 0]]
-    assert plans[torch.tensor([1])].condition.tolist() == [1]
-    closed = plans.with_end()
-    assert closed.durations.tolist() == [[1, 2, 0], [3, 0, 0]]
-    assert closed.without_end().durations.tolist() == [[1, 2], [3, 0]]
-    first, last = plans[:1].split(0.5)
-    assert (first.durations.tolist(), last.durations.tolist()) == ([[1]], [[2]])
-    for fields, words in (
-        ({"durations": torch.tensor([[1.0, -1], [1, 1]])}, "durations[0, 1]"),
-        ({"durations": torch.tensor([[1.0, torch.inf], [1, 1]])}, "durations[0, 1]"),
-        ({"durations": torch.ones(2)}, "`durations` must have shape"),
-        ({"condition": torch.tensor([0.5, 1])}, "condition"),
-    ):
-        with refuses(words):
-            RecordedPlans(plans.actions, 2, **fields)
+    first, last = PLANS[:1].split(0.34)
+    assert (told(first.durations), told(last.durations)) == ([[2.5, 1.5]], [[None]])
+    assert (told(first.began), told(last.began)) == ([[0, 2.5]], [[4]])

@@ -78,16 +78,10 @@ def test_windows_cut_events_and_what_was_watched():
         read(TABLE, from_=100)
 
 
-def test_merging_dropping_and_renaming():
-    merged = read(TABLE, merge_repeats=True)
-    assert merged.events.loc[merged.events["behaviour"] == "walk", ["start", "stop"]].to_numpy().tolist() == [
-        [4, 5],
-        [8, 12],
-    ]
+def test_what_is_dropped_was_watched():
     left = read(TABLE, drop=["walk"])
     assert set(left.events["behaviour"]) == {"rest", "eat"}
     assert left.watched.equals(read(TABLE).watched)
-    assert set(read(TABLE, rename={"walk": "move", "eat": "feed"}).events["behaviour"]) == {"rest", "move", "feed"}
 
 
 def test_starts_alone_leave_stops_unknown_unless_the_next_ends_them():

@@ -15,7 +15,7 @@ from neuroprior.behaviour.durations.survival import survival_curve
 from neuroprior.behaviour.reporting.durations import duration_section
 from neuroprior.behaviour.reporting.scores import evaluate_saved
 from neuroprior.priors import UniformPrior
-from tests.support.sources import FALSE_ALARM, refuses, seeded
+from tests.support.sources import refuses, seeded
 
 
 def censored(seed, subjects=8, ratio=1.0, strata=False, spread=0.4):
@@ -159,15 +159,8 @@ def test_the_log_rank_test_by_enumeration(strata):
         observed[name] = (statistic >= statistic[0] - 1e-9).mean()
     assert {name: p for name, (p, _) in result.tests.items()} == pytest.approx(observed)
     assert all(corrected >= p for p, corrected in result.tests.values())
-
-
-def test_bouts_of_a_subject_may_be_alike_and_a_difference_is_found():
-    alarms = [duration_survival(censored(seed, 10), 199, seeded(seed)).tests["rest"][0] < 0.05 for seed in range(100)]
-    assert sum(alarms) <= stats.binom.isf(FALSE_ALARM, 100, 0.05)
-    for seed in range(5):
-        tests = duration_survival(censored(seed, 16, 4.0), 999, seeded(seed)).tests
-        assert tests["rest"][1] < 0.05
-    assert "rest: p = " in repr(duration_survival(censored(0, 16, 4.0), 999, seeded(0)))
+    name, (_, corrected) = min(result.tests.items(), key=lambda one: one[1])
+    assert f"{name}: p = {corrected:.2g}" in repr(result)
 
 
 def test_without_conditions_there_are_curves_alone():
@@ -267,11 +260,6 @@ def test_bouts_are_cut_off_where_watching_ends():
     plans = watched.plans()
     assert plans.cut_off[plans.mask()].tolist() == watched.cut_off.tolist()
     assert watched.window(stop=3.0).cut_off.tolist() == [True, True, True]
-
-
-def test_marks_of_what_was_cut_off_are_checked():
-    with refuses("`cut_off` must be bool, of plans with durations"):
-        RecordedPlans(torch.zeros(1, 2, dtype=torch.long), 1, cut_off=torch.zeros(1, 2, dtype=torch.bool))
 
 
 @pytest.mark.parametrize(("subjects", "starred"), [(16, ["survival of rest"]), (4, [])])

@@ -201,7 +201,7 @@ GOOD = npz(actions=np.zeros((20, 3), np.uint8), num_actions=2)
     [
         (b"0,1", ["not a .npz file"]),
         (GOOD[:-30], ["not a .npz file"]),
-        (npz(plans=[[1]]), ["no array 'actions'"]),
+        (npz(plans=[[1]]), ["no array 'actions'; it has plans"]),
         (npz(actions=np.array([[1, None]], object)), ["actions", "Python objects"]),
         (npz(actions=[["a"]]), ["actions", "numbers"]),
         (npz(actions=[[1.0]]), ["actions", "integers"]),

@@ -54,16 +54,13 @@ def test_the_seed_draws_the_folds():
         (None, 5, ("plans, 4", "got 5")),
         ([0, 0, 1, 1], 3, ("groups, 2", "got 3")),
         ([7, 7, 7, 7], 5, ("plans, 4", "got 5")),
+        ([], 2, ("0",)),
     ],
 )
 def test_bad_numbers_of_folds(group, number, words):
+    plans = torch.zeros(4 if group is None else len(group), 2).long()
     with refuses("folds", *words):
-        folds(Plans(torch.zeros(4, 2).long(), 2, group=None if group is None else torch.tensor(group)), number)
-
-
-def test_no_plans_have_no_folds():
-    with refuses("folds", "0"):
-        folds(Plans(torch.zeros(0, 2).long(), 2), 2)
+        folds(Plans(plans, 2, group=None if group is None else torch.tensor(group).long()), number)
 
 
 def in_steps(length: int, kind: str, pad: int = 0) -> RecordedPlans:

@@ -53,26 +53,6 @@ def test_trajectories_become_plans(as_what, kind):
     assert from_trajectories(given_as, 3, observations=None).context is None
 
 
-def test_an_environment_of_gymnasium():
-    gym = pytest.importorskip("gymnasium")
-    env = gym.make("CartPole-v1")
-    env.action_space.seed(0)
-    trajectories = []
-    for seed in range(3):
-        observation, _ = env.reset(seed=seed)
-        trajectory, over = [], False
-        while not over:
-            action = env.action_space.sample()
-            after, reward, terminated, truncated, info = env.step(action)
-            trajectory.append((observation, action, reward, terminated, truncated, info))
-            observation, over = after, terminated or truncated
-        trajectories.append(trajectory)
-    plans = from_trajectories(trajectories, 2)
-    assert plans.mask().sum(1).tolist() == [len(trajectory) for trajectory in trajectories]
-    assert plans.context.shape == (3, plans.max_length, 4)
-    assert torch.equal(plans.context[1, 4], torch.tensor(trajectories[1][4][0]))
-
-
 def same(one, other):
     assert (one.num_actions, one.end) == (other.num_actions, other.end)
     for key in ("actions", "lengths", "context", "group"):
@@ -159,8 +139,9 @@ def minari(tmp_path, monkeypatch):
         {"context": torch.tensor([5, 2])},
         {"context": torch.tensor([[0.5, 2], [1, 1]])},
         {"group": torch.tensor([1, 0]), "group_names": ("m1", "m2")},
+        {"end": 1},
     ],
-    ids=["actions", "names", "features", "index per plan", "features per plan", "groups"],
+    ids=["actions", "names", "features", "index per plan", "features per plan", "groups", "end"],
 )
 def test_minari_there_and_back(minari, more):
     plans = Plans(ACTIONS, 3, LENGTHS, ("up", "down", "stay"), **more)
@@ -170,12 +151,6 @@ def test_minari_there_and_back(minari, more):
     dataset = minari.load_dataset("mice/field-v0")
     assert (dataset.total_episodes, dataset.total_steps) == (2, 4)
     assert [len(episode.observations) for episode in dataset] == [4, 2]
-
-
-def test_minari_keeps_the_end_symbol(minari):
-    plans = Plans(ACTIONS, 3, LENGTHS).with_end()
-    write_minari(plans, "closed-v0")
-    same(read_minari("closed-v0"), plans)
 
 
 def made_by_others(minari, name, actions, action_space, observations, observation_space):

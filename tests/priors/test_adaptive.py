@@ -194,25 +194,6 @@ def test_earlier_sequences_are_handed_on(tmp_path):
     assert not adapted.log_prob(new).allclose(prior.log_prob(new))
 
 
-def test_experts_of_an_ensemble_begin_with_what_was_counted():
-    """Each follows the individual, and the mixture with them; what counts nothing stays as it was."""
-    chain, urn = MarkovPrior(3, 1).fit(SKEWED), AdaptivePrior(UniformPrior(3), [2.0])
-    mixture = MixturePrior(3, [chain, urn])
-    some, new = Plans(torch.tensor([[0, 2, 2, 1], [2, 0, 1, 1]]), 3, torch.tensor([4, 1])), torch.tensor([[2, 2, 1]])
-    due = MixturePrior(3, [chain, adapt(urn, some)])
-    assert adapt(mixture, some).log_prob(new).allclose(due.log_prob(new))
-    assert not due.log_prob(new).allclose(mixture.log_prob(new))
-    with refuses("`prior` must learn along a sequence", "MarkovPrior does not"):
-        adapt(chain, some)
-
-
-def test_it_is_known_by_name():
-    learned, _ = individuals(20, 80, 2.0, 5)
-    prior = fit(learned, "adaptive")
-    assert isinstance(prior.base, ContextTreePrior)
-    assert prior.concentrations[1] < inf
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -240,3 +240,36 @@ def test_fit_makes_a_prior_for_the_plans():
         fit(features, "markof")
     with refuses("max_steps", "MarkovPrior"):
         fit(features, "markov", max_steps=3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrong", "word"),
+    [
+        (UniformPrior, {"num_actions": 0}, "num_actions"),
+        (MarkovPrior, {"initial": "both"}, "initial"),
+        (MarkovPrior, {"backoff": "good-turing"}, "backoff"),
+        (ContextTreePrior, {"base": "prior"}, "base"),
+        (ContextTreePrior, {"beta": 0}, "beta"),
+        (ContextTreePrior, {"depth": 10**9}, "depth"),
+        (GRUPrior, {"window": -1}, "window"),
+        (TransformerPrior, {"window": 1.5}, "window"),
+        (GRUPrior, {"context_size": 0}, "context_size"),
+        (TransformerPrior, {"num_layers": 0}, "num_layers"),
+        (GRUPrior, {"num_contexts": 2, "context_size": 2}, "not both"),
+        (TransformerPrior, {"width": 10, "num_heads": 4}, "num_heads"),
+        (TransformerPrior, {"width": 12, "num_heads": 4}, "num_heads"),
+        (TransformerPrior, {"num_heads": 0}, "num_heads"),
+        (SwitchingPrior, {"num_modes": 0}, "num_modes"),
+        (SwitchingPrior, {"num_modes": 10**6}, "num_modes"),
+        (SwitchingPrior, {"switching": "never"}, "switching"),
+        (SwitchingPrior, {"phases": 0}, "phases"),
+        (SwitchingPrior, {"folds": 0}, "folds"),
+        (SwitchingPrior, {"restarts": 0}, "restarts"),
+        (SwitchingPrior, {"max_iterations": 2.5}, "max_iterations"),
+        (SwitchingPrior, {"tolerance": float("inf")}, "tolerance"),
+    ],
+)
+def test_wrong_arguments_are_named(kind, wrong, word):
+    """Of other numbers `tests/test_bad_numbers.py` says so."""
+    with refuses(word):
+        kind(**({"num_actions": 3} | wrong))

@@ -14,54 +14,27 @@ import pytest
 import torch
 from safetensors.torch import load as read_tensors
 
-from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior, UniformPrior, load, save
+from neuroprior import GRUPrior, MarkovPrior, TransformerPrior, UniformPrior, load, save
 from neuroprior.priors import Prior, StackedPrior, serialization
 from neuroprior.priors.saved import SavedModule
 from tests.support.saved import SAVED, content_of, rewrite
 from tests.support.sources import refuses, says, seeded
 
 A = 3
-INDEX, FEATURES = {"num_contexts": 4}, {"context_size": 2}
-PRIORS = [
-    (UniformPrior, {}),
-    *((MarkovPrior, {"order": k, "initial": i, "smoothing": 0.3}) for k in (0, 1, 3) for i in ("joint", "lower")),
-    (MarkovPrior, {"order": 2} | INDEX),
-    *((GRUPrior, {"hidden_size": 8, "num_layers": 2} | current) for current in ({}, {"window": 2}, INDEX, FEATURES)),
-    *((TransformerPrior, {"width": 8, "num_heads": 2} | current) for current in ({}, {"window": 2}, INDEX, FEATURES)),
-]
 
 
-def draw_context(arguments, per, num=40, length=4):
-    shape = (num,) if per == "plan" else (num, length)
-    if "num_contexts" in arguments:
-        return torch.randint(4, shape, generator=seeded(1))
-    return torch.rand(*shape, 2, generator=seeded(1)) if "context_size" in arguments else None
-
-
-@pytest.mark.parametrize("fitted", [None, "plan", "step"])
-@pytest.mark.parametrize(("kind", "arguments"), PRIORS)
-def test_round_trip(kind, arguments, fitted, tmp_path):
-    prior = kind(A, **arguments)
-    plans = torch.randint(A, (40, 4), generator=seeded(0))
-    context = draw_context(arguments, fitted or "step")
-    if fitted:
-        quick = (
-            {"generator": seeded(2), "max_steps": 5, "progress": False} if kind in (GRUPrior, TransformerPrior) else {}
-        )
-        prior.fit(Plans(plans, A, context=context), **quick)
-    folder = tmp_path / "new" / "model"
+@pytest.mark.parametrize("name", SAVED)
+def test_round_trip(name, tmp_path):
+    """What it predicts then is compared in `test_contracts.py`."""
+    prior, folder = SAVED[name](), tmp_path / "new" / "model"
     assert save(prior, folder) == folder
     assert sorted(path.name for path in folder.iterdir()) == ["config.json", "model.safetensors"]
-    again = load(folder)
-    assert type(again) is kind
-    assert again.config == prior.config
-    assert again.context_per == prior.context_per
+    again = load(folder, kind=SavedModule)
+    assert type(again) is type(prior)
+    assert (again.config, again.learned) == (prior.config, prior.learned)
     assert not again.training
-    longer = torch.randint(A, (40, 7), generator=seeded(3))
-    context = draw_context(arguments, "step", length=7)
-    with torch.no_grad():
-        longer = Plans(longer, A, context=context)
-        assert torch.equal(again.log_prob(longer), prior.eval().log_prob(longer))
+    for key, value in prior.state_dict().items():
+        assert value.equal(again.state_dict()[key]), key
 
 
 @pytest.mark.parametrize(
@@ -146,21 +119,14 @@ def test_missing(folder):
     refused(folder, "model.safetensors", error=FileNotFoundError)
 
 
-@pytest.mark.parametrize("share", [0, 0.1, 0.5, 0.99])
 @pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
-def test_truncated(folder, name, share):
+def test_cut_off_and_one_byte_changed(folder, name):
     data = (folder / name).read_bytes()
-    (folder / name).write_bytes(data[: int(len(data) * share)])
-    refused(folder, name)
-
-
-@pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
-def test_one_byte_changed(folder, name):
-    data = (folder / name).read_bytes()
-    for at in (0, 9, 60, len(data) // 3, len(data) // 2, -3):
-        changed = bytearray(data)
-        changed[at] ^= 1
-        (folder / name).write_bytes(changed)
+    damaged = [data[: int(len(data) * share)] for share in (0, 0.1, 0.5, 0.99)]
+    for at in (0, 9, 60, len(data) // 3, len(data) // 2, len(data) - 3):
+        damaged.append(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
+    for content in damaged:
+        (folder / name).write_bytes(content)
         refused(folder, name)
 
 
@@ -185,23 +151,15 @@ BUSHY = reduce(lambda inner, _: mixture(inner, inner), range(14), UNIFORM)["conf
     ("change", "word"),
     [
         ({"version": 1}, "version 1"),
-        ({"version": None}, "version"),
         ({"version": "2"}, "version"),
         ({"format": "another model"}, "format"),
         ({"prior": "os.system"}, "os.system"),
         ({"prior": "NeuralPrior"}, ""),
-        ({"prior": None}, ""),
-        ({"prior": []}, ""),
         ({"prior": {"a": 1}}, ""),
         ({"prior": "UniformPrior"}, ""),
-        ({"prior": "TransformerPrior"}, ""),
-        ({"config": None}, "config"),
         ({"config": []}, "config"),
-        ({"config": {}}, ""),
-        ({"config": {"num_actions": "3"}}, ""),
         ({"config": {"num_actions": 4}}, ""),
         ({"config": {"num_actions": 3, "unheard": 1}}, "unheard"),
-        ({"config": {"num_actions": 3, "order": -1}}, ""),
         ({"config": {"num_actions": 3, "order": 900_000_000}}, ""),
         ({"config": {"num_actions": 3, "num_layers": 10**6}}, ""),
         ({"config": {"num_actions": 2**70}}, "at most 9223372036854775807"),
@@ -245,12 +203,6 @@ def test_nothing_is_executed(folder, how, name):
         (folder / name).write_bytes(pickle.dumps(Poison(touched)))
     refused(folder, name)
     assert not touched.exists()
-
-
-def test_the_tensors_of_another_model(folder, tmp_path):
-    other = save(GRUPrior(A, hidden_size=16), tmp_path / "other")
-    rewrite(folder, content_of(folder), read_tensors((other / "model.safetensors").read_bytes()))
-    refused(folder, "model.safetensors")
 
 
 @pytest.mark.parametrize("name", SAVED)

@@ -27,12 +27,6 @@ def test_rows_of_parts_of_a_tensor():
         assert rows_of(part, row).equal(part[row])
 
 
-def test_many_rows():
-    values = torch.rand(100, 3, dtype=torch.float64)
-    row = torch.randint(100, (300_000,), generator=torch.Generator().manual_seed(0))
-    assert rows_of(values, row).equal(values[row])
-
-
 def test_gradients_pass():
     values = torch.rand(4, 2, requires_grad=True)
     rows_of(values, torch.tensor([1, 1, 3])).sum().backward()

@@ -31,15 +31,6 @@ def bits(prior, plans: Plans) -> float:
     return -float(prior.log_prob(plans).detach().sum()) / int(plans.mask().sum()) / LOG_2
 
 
-@pytest.mark.parametrize("length", [4, 6])
-def test_frequent_plans_keep_their_probability(length):
-    # Half of all plans are one and the same; the others are one of 4**length, below and above MAX_DISTINCT.
-    same = torch.zeros(4000, length, dtype=torch.long)
-    plans = torch.cat([same, torch.randint(4, (4000, length), generator=seeded(0))])
-    prior = GRUPrior(4, 32).fit(plans, generator=seeded(0), progress=False, max_steps=150)
-    assert float(prior.log_prob(same[:1]).detach().exp()) == pytest.approx(0.5 * (1 + 4.0**-length), abs=0.03)
-
-
 @pytest.mark.parametrize(("length", "merged"), [(5, True), (6, False)])
 def test_equal_plans_are_merged_where_few_are_distinct(length, merged):
     plans = Plans(torch.randint(4, (9000, length), generator=seeded(0)), 4)
@@ -179,14 +170,6 @@ def test_the_combined_prior_counts_first_and_trains_while_there_is_time(monkeypa
     assert settings == {"seconds": 50.0}
 
 
-def test_small_gains_are_worth_going_on_for():
-    plans = Plans(drawn().actions.clamp(max=1), 3)
-    settings = how(40, learning_rate=5e-4, check_every=5, patience=5, validation=plans)
-    gains = -torch.tensor([entry["validation_bits"] for entry in train(GRUPrior(3, 8), plans, settings, 0)]).diff()
-    assert 0 < float(gains.max()) < 0.1
-    assert len(gains) > 3
-
-
 def test_every_setting_changes_the_training():
     plans = drawn(60, 9).actions
     same = {"max_steps": 6, "check_every": 6, "batch_size": 20, "progress": False}
@@ -247,13 +230,6 @@ def test_progress_in_a_log_file_is_lines(seconds, progress, steps, monkeypatch, 
     assert said == [f"training: step {step} of at most 8" for step in steps]
 
 
-def test_fitting_again_takes_the_new_plans_window():
-    prior, given = GRUPrior(3, 8), GRUPrior(3, 8, window=2)
-    for length in (3, 6):
-        assert prior.fit(drawn(50, length), max_steps=2, progress=False).window == length - 1
-    assert given.fit(drawn(50, 6), max_steps=2, progress=False).window == 2
-
-
 def test_a_fair_share_of_unequal_plans_is_held_out(monkeypatch):
     """Of one long plan and many short ones: never nearly all actions, nor hardly any."""
     plans = Plans(torch.zeros(40, 300, dtype=torch.long), 2, torch.tensor([300] + [2] * 39))
@@ -294,14 +270,8 @@ def test_validation_plans_stop_a_training_and_nothing_is_learned_from_them(name)
     zeros, ones = (Plans(torch.full((20, 6), action), 3) for action in (0, 1))
     first, last = (fitted(zeros, validation, check_every=2, max_steps=40) for validation in (ones, zeros))
     assert bits(first, zeros) > bits(last, zeros) + 0.002
-    refused = [
-        (Plans(torch.zeros(4, 3, dtype=torch.long), 7), ["7"]),
-        (Plans(named.actions, 3, action_names=("b", "a", "c")), ["validation", "action_names"]),
-        (Plans(named.actions, 3, lengths=torch.zeros(30, dtype=torch.long)), ["no validation plan has an action"]),
-    ]
-    for wrong, words in refused:
-        with refuses(*words):
-            fitted(named, wrong)
+    with refuses("no validation plan has an action"):
+        fitted(named, Plans(named.actions, 3, lengths=torch.zeros(30, dtype=torch.long)))
 
 
 @pytest.mark.slow

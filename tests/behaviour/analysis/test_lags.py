@@ -11,7 +11,6 @@ from scipy import stats
 from neuroprior import Plans
 from neuroprior.behaviour import Difference, HowFarBack, how_far_back, ratio_difference
 from neuroprior.behaviour.analysis.lags import FIRST_SHARE, _fallback, pieces
-from neuroprior.plans.folds import BLOCKS
 from tests.support.sources import FALSE_ALARM, refuses, seeded
 
 
@@ -128,21 +127,6 @@ def test_p_values_are_corrected_by_the_fallback_procedure(seed):
     assert _fallback(np.array([0.03])) == pytest.approx([0.03])
 
 
-def test_of_lags_without_a_gain_seldom_one_is_found():
-    """At most 5 % of 2,000 studies with uniform p-values, with a false-alarm probability of 1e-6."""
-    p_values = torch.rand(2000, 4, generator=seeded(1)).double().numpy()
-    assert sum(_fallback(row).min() < 0.05 for row in p_values) <= stats.binom.isf(1e-6, 2000, 0.05)
-
-
-def test_an_action_that_is_known_from_the_last_one():
-    """Three in a cycle, begun at random: log2 3 bits at lag 1, and none further back."""
-    plans = Plans((torch.arange(30)[:, None] + torch.arange(301)) % 3, 3)
-    result = how_far_back(plans, 2)
-    assert result.gains[0].mean == pytest.approx(math.log2(3), abs=0.01)
-    assert result.gains[1].mean == pytest.approx(0, abs=1e-3)
-    assert result.reach == 1
-
-
 def test_first_actions_may_be_left_out():
     """A cycle in the first ten actions; what comes after them is random."""
     cycle = (torch.arange(20)[:, None] + torch.arange(10)) % 3
@@ -150,15 +134,6 @@ def test_first_actions_may_be_left_out():
     whole, rest = how_far_back(plans, 1), how_far_back(plans, 1, skip=10)
     assert whole.gains[0].mean > 0.03 > 0 > rest.gains[0].low
     assert (whole.reach, rest.reach) == (1, 0)
-
-
-def test_what_is_not_there_is_seldom_found_and_what_is_there_is():
-    """At most 5 % of order-1 studies reach further; of order-2 studies, in which lag 2 adds some .05 bits, 80 % do."""
-    reach = [how_far_back(order_two(seed, 0.0)).reach for seed in range(60)]
-    assert sum(one > 1 for one in reach) <= stats.binom.isf(FALSE_ALARM, 60, 0.05)
-    assert min(reach) == 1
-    further = [how_far_back(order_two(seed, 0.35)).reach >= 2 for seed in range(60)]
-    assert sum(further) >= stats.binom.ppf(0.5, 60, 0.8)
 
 
 def test_plans_of_one_subject_or_without_pairs_are_refused():
@@ -213,12 +188,6 @@ def test_pieces_keep_contexts_and_groups():
     assert found.context.equal(found.actions.long() // 10)
     assert found.group.tolist() == [0] * 3 + [1] * 5 + [2]  # the plan: one group is none
     assert found.group_names is None
-
-
-def test_pieces_of_a_single_plan_are_grouped_by_parts():
-    found = pieces(Plans(torch.arange(100)[None] % 7, 7), 5, 1000)
-    assert len(found) == 96
-    assert found.group.equal(torch.arange(96) * BLOCKS // 96)
 
 
 def test_pieces_may_end():

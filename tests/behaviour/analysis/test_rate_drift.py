@@ -9,7 +9,7 @@ from scipy import optimize, stats
 from neuroprior import Plans
 from neuroprior._statistics import mean_interval
 from neuroprior.behaviour import RecordedPlans, Recordings, holm, rate_drift
-from neuroprior.behaviour.analysis.rate_drift import BINS, _change, overlap
+from neuroprior.behaviour.analysis.rate_drift import BINS, _change
 from tests.support.sources import FALSE_ALARM, refuses, seeded
 
 
@@ -48,11 +48,6 @@ def simulated(seed, slope=0.0, subjects=12, gaps=False, shares=False):
     order = np.lexsort((place, of))
     order = order[kept[order]]
     return recordings_of(frame.iloc[order], fragment[order])
-
-
-def test_overlap_by_hand():
-    start, stop = np.array([0.5, 2.0, np.nan]), np.array([2.25, 9.0, 1.0])
-    assert overlap(start, stop, np.arange(4.0)).tolist() == [[0.5, 1, 0.25], [0, 0, 1], [0, 0, 0]]
 
 
 @pytest.mark.parametrize("per", ["bouts", "time"])
@@ -114,12 +109,6 @@ def test_intervals_cover_a_fall_by_e_squared_with_gaps_and_without(gaps, per):
         hits[seed] = change.low <= -2 <= change.high
         assert change.p_value < 1e-4
     assert hits.sum() >= stats.binom.ppf(FALSE_ALARM, 60, 0.93)
-
-
-@pytest.mark.parametrize("per", ["bouts", "time"])
-def test_no_drift_is_seldom_found(per):
-    alarms = sum(rate_drift(simulated(seed, 0.0, 10, True), per).corrected.min() < 0.05 for seed in range(100))
-    assert alarms <= stats.binom.isf(FALSE_ALARM, 100, 0.06)
 
 
 def test_of_equally_informed_units_the_interval_is_that_of_student():

@@ -151,22 +151,6 @@ def sexes_differ(strength: float, change: bool):
     return apply
 
 
-def test_sexes_that_differ_cost_no_power():
-    """In most of 20 studies knowing the condition saves bits with strata (as with sexes alike), in few without."""
-    conditions, sex = [[animal // 2 % 2] for animal in range(16)], [animal % 2 for animal in range(16)]
-    found: Counter[str] = Counter()
-    for seed in range(20):
-        for strength in (0.0, 2.0):
-            change = sexes_differ(strength, True)
-            plans = stratified(conditions, sex, seed, length=150, num_actions=4, habit=0.3, change=change)
-            found[f"{strength}"] += compare_conditions(plans, 199, seeded(seed)).tests["bits"][0] < 0.05
-            without = compare_conditions(replace(plans, stratum=None, stratum_names=None), 199, seeded(seed))
-            found[f"{strength} without"] += without.tests["bits"][0] < 0.05
-    assert found["2.0"] >= 15, found
-    assert found["0.0"] >= 15, found
-    assert found["2.0 without"] <= found["2.0"] - 5, found
-
-
 def test_strata_raise_no_false_alarms():
     """Of 100 studies, in each of the tests; sexes differ much, and are not treated equally often."""
     conditions = [[int(animal % 3 == 0) if animal % 2 else int(animal % 3 != 0)] for animal in range(12)]

@@ -65,13 +65,6 @@ def test_trials_of_a_session_are_recordings_of_their_own(study):
     assert [row[:2] for row in rows(choices)] == [("f", "left"), ("f", "right"), ("f", "left")]
 
 
-def test_files_of_one_name_in_two_folders_are_two_recordings(study, tmp_path):
-    for day in (1, 2):
-        study("behaviour,start,stop\nrest,0,5\nwalk,5,7\n", name=f"day{day}/a.csv")
-    found = read([tmp_path / "day1" / "a.csv", tmp_path / "day2" / "a.csv"])
-    assert [row[0] for row in rows(found)] == ["day1/a", "day1/a", "day2/a", "day2/a"]
-
-
 def test_units_are_not_mixed(study, tmp_path):
     found = study("subject,behaviour,start (s),duration (ms)\na,groom,0,5000\na,rest,5,250\n")
     assert [row[2:] for row in rows(found)] == [(0, 5), (5, 5.25)]
@@ -148,19 +141,6 @@ def test_times_that_cannot_be_read_are_errors(study):
         study("animal,behaviour,start\na,x,00:00:01:12\na,y,00:00:02:13\n")
     half_days = study("animal,behaviour,start\na,x,09:00:00 AM\na,y,01:00:00 PM\n")
     assert half_days.events["start"].tolist() == [32400, 46800]
-
-
-def test_many_small_recordings_take_no_time_each():
-    number = 3000
-    frame = pd.DataFrame(
-        {
-            "id": np.repeat(np.arange(number), 20),
-            "behaviour": np.tile(list("abcde" * 4), number),
-            "start": np.tile(np.arange(20.0), number),
-            "stop": np.tile(np.arange(1.0, 21), number),
-        }
-    )
-    assert read(frame).num_recordings == number
 
 
 def test_files_are_told_apart_by_as_many_folders_as_it_takes(study, tmp_path):

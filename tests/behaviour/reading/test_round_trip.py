@@ -25,32 +25,15 @@ NAMES = st.lists(
     max_size=5,
     unique=True,
 )
+USES = ("recording", "subject", "behaviour", "start", "stop", "duration")
 VOCABULARIES = [
-    {
-        "recording": "session",
-        "subject": "animal",
-        "behaviour": "behaviour",
-        "start": "start",
-        "stop": "stop",
-        "duration": "duration",
-    },
-    {
-        "recording": "Observation id",
-        "subject": "Subject",
-        "behaviour": "Behavior",
-        "start": "Start (s)",
-        "stop": "Stop (s)",
-        "duration": "Duration (s)",
-    },
-    {
-        "recording": "video",
-        "subject": "mouse_id",
-        "behaviour": "Label",
-        "start": "onset_s",
-        "stop": "offset_s",
-        "duration": "bout_time",
-    },
-    {"recording": "Trial", "subject": "ID", "behaviour": "State", "start": "Begin", "stop": "End", "duration": "Dur"},
+    dict(zip(USES, words, strict=True))
+    for words in (
+        ("session", "animal", "behaviour", "start", "stop", "duration"),
+        ("Observation id", "Subject", "Behavior", "Start (s)", "Stop (s)", "Duration (s)"),
+        ("video", "mouse_id", "Label", "onset_s", "offset_s", "bout_time"),
+        ("Trial", "ID", "State", "Begin", "End", "Dur"),
+    )
 ]
 EVENT_WORDS = [
     ("START", "STOP"),

@@ -90,17 +90,6 @@ def test_units_are_counted_by_their_condition_and_by_the_one_predicted():
     assert pairs.count(("drug 0", "drug 1")) != pairs.count(("drug 1", "drug 0"))
 
 
-def test_a_report_has_the_section(tmp_path):
-    made = report(changed(between(12)), fits=QUICK_IN_TWO, out=tmp_path, sections=["file", "conditions"])
-    result = compare_conditions(changed(between(12)), generator=seeded(0))
-    assert made.said[0] == result.verdict
-    names = ["condition_tests", "conditions", "condition_blocks"]
-    assert {*names} <= {*made.tables}
-    assert all((tmp_path / f"{name}.csv").exists() for name in names)
-    assert "conditions" in made.figures
-    assert result.smallest_p == pytest.approx(0.0022, abs=1e-4)
-
-
 @pytest.mark.parametrize("change", [0, 0.2, 1])
 def test_the_headline_says_exactly_what_is_starred(change):
     """Each starred finding is said or named at the top, and nothing else; the verdict agrees."""
@@ -173,15 +162,6 @@ def test_features_that_differ_most_come_first(conditions):
     keys = [*zip(rank, features["corrected"], features["p_value"], -features["statistic"], strict=True)]
     assert keys == sorted(keys)
     assert len({key[:3] for key in keys}) < len(keys)
-
-
-def test_units_that_cannot_be_compared_are_counted():
-    """Of eight animals under both conditions one has lost the sessions under the second."""
-    plans = changed(within(8))
-    lost = (plans.group == 3) & (plans.condition == 1)
-    text = " ".join(section_of(plans[~lost])[0].text)
-    assert "1 subjects that are not under every condition were left out" in text
-    assert "left out" not in " ".join(section_of(plans)[0].text)
 
 
 def test_each_two_of_three_conditions_have_a_table():

@@ -213,11 +213,12 @@ def test_few_plans_have_scores_and_short_lags(plans, tmp_path):
 
 
 @pytest.mark.parametrize("skip", [0, 2, 5])
-def test_information_by_lag_is_of_the_actions_that_count(skip):
+@pytest.mark.parametrize(("kind", "name"), [("lags", "markov"), ("gru-lags", "gru")])
+def test_information_by_lag_is_of_the_actions_that_count(kind, name, skip):
     """Of plans of 12 actions: those after the first `skip` that have three before them."""
-    plans, design = replace(chain(10, 12), lengths=None), Design(2, skip=skip, reach=3)
-    arrays = fit_and_score(plans, None, design, Job(0, "lags", ACTIONS))
-    assert arrays["markov/actions"].sum(1).tolist() == [5 * (12 - max(skip, 3))] * 4
+    plans, design = replace(chain(10, 12), lengths=None), Design(2, skip=skip, reach=3, max_steps=1)
+    arrays = fit_and_score(plans, None, design, Job(0, kind, ACTIONS))
+    assert arrays[f"{name}/actions"].sum(1).tolist() == [5 * (12 - max(skip, 3))] * 4
 
 
 def test_empty_and_short_plans_to_choose_on_are_no_obstacle(tmp_path):
@@ -328,13 +329,6 @@ def test_the_reach_of_lags_is_half_of_the_shorter_plans():
         arrays = fit_and_score(plans, test, Design(1, reach=5), Job(0, "lags", ACTIONS))
         assert arrays["markov/bits"].shape == (4, 6)
     assert fit_and_score(drawn(20, 1), short, Design(1), Job(0, "lags", ACTIONS)) == {}
-
-
-def test_all_pieces_and_all_lags_are_scored():
-    plans, design = drawn(40, 12), Design(2, reach=3, max_steps=1)
-    for kind, name in (("lags", "markov"), ("gru-lags", "gru")):
-        arrays = fit_and_score(plans, None, design, Job(0, kind, ACTIONS))
-        assert arrays[f"{name}/actions"].sum(1).tolist() == [20 * 9] * 4
 
 
 def test_a_context_that_tells_the_action_leaves_nothing_to_the_past():

@@ -2,17 +2,13 @@
 
 import pandas as pd
 import pytest
-import torch
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
 
-from neuroprior.behaviour.recorded_plans import RecordedPlans
-from neuroprior.behaviour.reporting.drawing import FEWER, KINDS, MARKOV, MORE, SPARE, STRIPS, colors, lines
+from neuroprior.behaviour.reporting.drawing import FEWER, KINDS, MARKOV, MORE, SPARE, colors, lines
 from neuroprior.behaviour.reporting.figures import (
     condition_figure,
     drift_figure,
     dwell_figure,
-    ethogram_figure,
     motif_figure,
 )
 
@@ -84,17 +80,6 @@ def test_drift_stands_at_the_middles_of_parts_and_at_the_numbers_of_plans():
     assert [label.get_text() for label in below.get_yticklabels()] == ["low", "mid", "high"]  # from below
     bars = [line.get_xdata().tolist() for line in below.lines if len(line.get_xdata()) == 2]
     assert bars == [pytest.approx([bits - 0.2, bits + 0.3]) for bits in (1.0, 1.5, 2.0)]
-
-
-def test_plans_stand_in_their_own_order_and_not_by_name():
-    """One action a plan, so that each row has one colour; parts of a plan are in one row."""
-    actions = torch.tensor([[0, 0], [1, 1], [2, 2], [1, 1]])
-    plans = RecordedPlans(actions, 3, recording=("c", "a", "b", "a"), group=torch.zeros(4, dtype=torch.long))
-    for some, want in (([0, 1, 2], [0, 1, 2]), ([1, 2, 0], [1, 2, 0]), ([0, 1, 3, 2], [0, 1, 2])):
-        (axes,) = ethogram_figure(plans[torch.tensor(some)]).axes
-        column = axes.images[0].get_array()[:, 0]
-        shown = [tuple(color[:3]) for color in column if color[3] == 1]
-        assert [*dict.fromkeys(shown)] == [to_rgb(STRIPS[action]) for action in want]
 
 
 def test_motifs_stand_where_they_are():

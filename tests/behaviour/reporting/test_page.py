@@ -379,9 +379,9 @@ def test_an_ethogram_has_the_actions_in_their_colours_by_condition_and_group():
 
 
 def test_parts_of_a_plan_are_in_one_row_of_an_ethogram():
-    """In their order, with a blank between them; plans of one name in two groups are two."""
+    """In their order, not that of names, with a blank between them; plans of one name in two groups are two."""
     actions, group = torch.tensor([[0, 1], [1, 0], [0, 0], [1, 1]]), torch.tensor([0, 1, 0, 0])
-    plans = RecordedPlans(actions, 2, torch.tensor([2, 2, 1, 2]), group=group, recording=["x", "x", "x", "y"])
+    plans = RecordedPlans(actions, 2, torch.tensor([2, 2, 1, 2]), group=group, recording=["y", "y", "y", "x"])
     rows, _ = strips(ethogram_figure(plans))
     due = [[0, 1, None, 0], [1, 1, None, None], [1, 0, None, None]]
     shown = [[to_hex(color[:3]) if color[3] else None for color in row] for row in rows]

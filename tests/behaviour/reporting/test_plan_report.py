@@ -168,13 +168,6 @@ def test_options_of_files_reach_the_reader(tmp_path):
     assert (labelled["behaviours"], labelled["kinds"]) == (96, 4)
 
 
-def test_a_report_replaces_an_earlier_one_of_its_folder(tmp_path):
-    plans, fits = chain(), FitOptions(models=["counts"], folds=2, processes=1)
-    first = report(plans, out=tmp_path, fits=fits, sections=["scores"])
-    again = report(plans, out=tmp_path, fits=fits, sections=["scores"])
-    assert again.tables["scores"].equals(first.tables["scores"])
-
-
 def test_recordings_have_a_time_budget_and_a_reference(tmp_path):
     rows = [
         (f"m{a}", "drug" if a % 2 else "saline", "abc"[(t + a) % 3], 2 * t, 2 * t + (2 if (t + a) % 3 else 1))

@@ -9,10 +9,8 @@ import vlmc
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuroprior import ContextTreePrior, Plans, load, save
-from neuroprior.priors.counts.context_tree import Weighting
-from neuroprior.priors.counts.histories import Counts, Tree
-from tests.support.sources import refuses, seeded
+from neuroprior import ContextTreePrior, Plans
+from tests.support.sources import seeded
 
 BEGINNING = "beginning"
 
@@ -209,18 +207,6 @@ def test_the_best_tree_is_vlmcs(num_actions, order, depth, beta, seed):
             torch.testing.assert_close(leaf.probs.tolist(), theirs.get_distribution(list(history)))
 
 
-def test_the_best_tree_of_a_tree():
-    """Action 1 forgets all; after 0 the action before it matters."""
-    probs = {(1,): 0.5, (0, 0): 0.9, (1, 0): 0.2}
-    plan = [1]
-    for u in torch.rand(4_000, generator=seeded(0)).tolist():
-        plan.append(int(u < probs[(1,) if plan[-1] else tuple(plan[-2:])]))
-    leaves = [leaf for leaf in ContextTreePrior(2, 6).fit(torch.tensor([plan])).map_tree() if not leaf.opening]
-    assert [leaf.history for leaf in leaves] == [(1,), (0, 0), (1, 0)]
-    for leaf in leaves:  # within five standard errors of 1,000 draws or more
-        assert float(leaf.probs[1]) == pytest.approx(probs[leaf.history], abs=0.08)
-
-
 def test_krichevsky_trofimov_by_hand():
     """Depth 0, actions 0 1 0 0: 1/2 * 1/4 * 3/6 * 5/8 (Willems, Shtarkov and Tjalkens 1995, section III)."""
     prior = ContextTreePrior(2, 0, alpha=0.5, base="uniform").fit(torch.tensor([[0, 1, 0, 0]]))
@@ -242,59 +228,9 @@ def test_alpha_is_the_most_probable_one():
         assert float(ContextTreePrior(3, 2, base="uniform").fit(plans).pseudo_counts.sum()) == size
 
 
-def test_without_counts_it_is_uniform():
-    for prior in (ContextTreePrior(3), ContextTreePrior(3).fit(torch.zeros(0, 4).long())):
-        torch.testing.assert_close(prior(torch.zeros(2, 4).long()).exp(), torch.full((2, 4, 3), 1 / 3))
-        assert prior.map_tree() == []
-        assert prior.log_evidence() == pytest.approx(0, abs=1e-12)
-
-
-def test_the_best_tree_of_what_never_occurred():
-    nothing = Tree.empty(3, torch.device("cpu")), Counts.empty(torch.device("cpu"))
-    for beta in (0.05, 0.2, 0.5, 0.9):
-        want = [math.log(max(p for _, p in trees(3, depth, beta))) for depth in (2, 1, 0)]
-        assert Weighting(*nothing, None, 3, 2, beta).absent() == pytest.approx(want)
-
-
-def test_default_beta():
-    assert [ContextTreePrior(actions).beta for actions in (1, 2, 4, 500)] == [0.5, 0.5, 0.75, 0.998]
-
-
-def test_a_deeper_tree_does_no_harm():
-    """Held out, depth 20 is as good as the order of the source."""
-    plan = draw(2, 4, 24_000, 5).view(-1, 40)
-    order, deep = (ContextTreePrior(4, depth).fit(plan[:500]).log_prob(plan[500:]).mean() / 40 for depth in (2, 20))
-    assert deep > order - 0.002
-
-
-@pytest.mark.parametrize("contexts", [None, 3])
-def test_loaded_it_knows_its_tree(contexts, tmp_path):
-    plans = Plans(draw(1, 3, 400, 1).view(-1, 8), 3, context=None if contexts is None else torch.arange(50) % 3)
-    prior = ContextTreePrior(3, 4, num_contexts=contexts).fit(plans)
-    copy = load(save(prior, tmp_path))
-    assert met(copy) == met(prior)
-    assert copy.log_evidence() == pytest.approx(prior.log_evidence())
-
-
 @pytest.mark.parametrize("name", ["bounds", "pair_row", "pair_action", "pair_count", "pseudo_counts", "parent"])
 def test_tables_that_do_not_fit_are_refused(name):
     tables = {key: t.clone() for key, t in ContextTreePrior(3, 2).fit(draw(1, 3, 100, 0)).state_dict().items()}
     tables[name][-1] = -1
     with pytest.raises(RuntimeError, match="do not fit"):
         ContextTreePrior(3, 2).load_state_dict(tables)
-
-
-WRONG = {
-    "num_actions": [0, "4"],
-    "depth": [-1, 2.5, True, 10**9],
-    "beta": [0, 1.0],
-    "alpha": [0, float("inf")],
-    "base": ["prior"],
-    "num_contexts": [0],
-}
-
-
-@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in WRONG.items() for value in values])
-def test_refuses_arguments(name, value):
-    with refuses(name):
-        ContextTreePrior(**({"num_actions": 3} | {name: value}))

@@ -89,38 +89,3 @@ def test_histories_longer_than_a_chunk(depth):
     assert torch.equal(prior(plans), Prior.forward(prior, plans))
     other = torch.cat([1 - plans[:, :7], plans], 1)
     assert torch.equal(prior(other), Prior.forward(prior, other))
-
-
-@pytest.mark.parametrize("make", [MarkovPrior, ContextTreePrior])
-def test_before_fit(make):
-    assert equals_stepping(make(3, 4), 1500, "none")
-    assert equals_stepping(make(3, 4, num_contexts=2), 1500, "step")
-
-
-@pytest.mark.parametrize("name", ["markov-3 joint", "markov-3 lower", "tree-6"])
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.int32])
-def test_small_integers_are_read_as_large_ones(name, dtype):
-    """Plans store their actions in 8 bits."""
-    make, depth, more = PRIORS[name]
-    prior = fitted(make, depth, more, "step")
-    plans = torch.randint(3, (2, 700), generator=seeded(5))
-    current = torch.randint(3, (2, 700), generator=seeded(6))
-    assert torch.equal(prior(plans.to(dtype), current.to(dtype)), prior(plans, current))
-
-
-@pytest.mark.parametrize("name", ["markov-0 joint", "markov-4 joint", "markov-4 lower", "tree-10"])
-def test_a_longer_plan_begins_as_a_shorter_one(name):
-    """What is read of a plan does not depend on how long it goes on, nor on the others."""
-    make, depth, more = PRIORS[name]
-    prior = fitted(make, depth, more, "none")
-    plans = torch.randint(3, (4, 1500), generator=seeded(7))
-    whole = prior(plans)
-    for length in (1, CHUNK, CHUNK + depth, 2 * CHUNK, 2 * (CHUNK + depth) + 1, 1000):
-        assert torch.equal(prior(plans[:, :length]), whole[:, :length]), length
-    assert torch.equal(prior(plans[2:3]), whole[2:3])
-
-
-def test_no_plans():
-    prior = fitted(MarkovPrior, 2, {}, "none")
-    assert prior(torch.zeros(0, 5).long()).shape == (0, 5, 3)
-    assert prior(torch.zeros(0, 1500).long()).shape == (0, 1500, 3)

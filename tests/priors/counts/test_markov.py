@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from neuroprior import MarkovPrior, Plans, UniformPrior
+from neuroprior import MarkovPrior, Plans
 from neuroprior.plans import constant_context
 from tests.support.sources import (
     FALSE_ALARM,
@@ -17,7 +17,6 @@ from tests.support.sources import (
     bits_per_action,
     distribution,
     every_plan,
-    fits,
     refuses,
     seeded,
 )
@@ -157,28 +156,6 @@ def test_counts(problem):
     torch.testing.assert_close(prior.log_prob(scored), taken.sum(1), rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("order", range(6))
-@pytest.mark.parametrize("initial", ["joint", "lower"])
-@pytest.mark.parametrize("contexts", [None, 2])
-def test_probabilities_of_all_plans_sum_to_one(order, initial, contexts):
-    actions = torch.randint(3, (40, 4), generator=seeded(order))
-    current = None if contexts is None else torch.arange(40) % 2
-    prior = MarkovPrior(3, order, initial=initial, num_contexts=contexts).fit(Plans(actions, 3, context=current))
-    for length in (0, 1, 3, 6):
-        probs = distribution(prior, length, None if contexts is None else torch.tensor(1))
-        assert float(probs.sum()) == pytest.approx(1, abs=1e-5)
-        assert (probs > 0).all()
-
-
-@pytest.mark.parametrize("order", [0, 1, 3])
-@pytest.mark.parametrize("fitted", [None, torch.zeros(0, 5).long(), torch.zeros(7, 0).long()])
-def test_without_counts_it_is_uniform(order, fitted):
-    prior = MarkovPrior(3, order)
-    if fitted is not None:
-        prior.fit(fitted)
-    torch.testing.assert_close(distribution(prior, 3), torch.full((27,), 1 / 27, dtype=torch.double))
-
-
 def test_by_hand():
     """Order 1, smoothing 1, plans 0 0 1 and 0 1: computed on paper from the docstring."""
     plans = Plans(torch.tensor([[0, 0, 1], [0, 1, 0]]), 2, torch.tensor([3, 2]))
@@ -207,18 +184,6 @@ def test_a_prior_without_context_leaves_that_of_the_plans_aside():
     torch.testing.assert_close(distribution(prior, 4), distribution(MarkovPrior(3, 2).fit(plans.actions), 4))
 
 
-def test_the_torus_source():
-    """DESIGN's figures for the best depth-4 plan, from the enumeration that the tests use."""
-    probs, plans = best_plan_distribution(), every_plan(4, 4)
-    assert float(-(probs * probs.log2()).sum()) == pytest.approx(7.27784, abs=5e-6)
-    matrix = torch.zeros(4, 4, dtype=torch.double)
-    for t in range(3):
-        matrix.index_put_((plans[:, t], plans[:, t + 1]), probs, accumulate=True)
-    turn = torch.tensor([4 / 9, 2 / 9, 1 / 9, 2 / 9], dtype=torch.double)
-    want = torch.stack([turn.roll(a) for a in range(4)])
-    torch.testing.assert_close(matrix / matrix.sum(1, keepdim=True), want)
-
-
 @pytest.mark.parametrize(("order", "figure"), [(0, 0.18054), (1, 0.05798), (2, 0.01387), (3, 0.0)])
 def test_divergence_from_the_torus_source(order, figure):
     """DESIGN's figures, reached from 100,000 plans but for the error of estimating the chain's probabilities.
@@ -234,50 +199,7 @@ def test_divergence_from_the_torus_source(order, figure):
     assert figure - 1e-5 < found < figure + excess + 1e-5
 
 
-def test_transition_matrix_of_the_torus_source():
-    matrix = MarkovPrior(4, 1).fit(Plans(best_plans(100_000, seed=9), 4)).transition_matrix()
-    turn = torch.tensor([4 / 9, 2 / 9, 1 / 9, 2 / 9])
-    # Each row is estimated from about 75,000 steps; 5 standard errors, doubled as above.
-    for action in range(4):
-        assert (matrix[action] - turn.roll(action)).abs().max() < 5 * math.sqrt(2 * 0.25 / 75_000)
-    torch.testing.assert_close(matrix.sum(1), torch.ones(4))
-
-
 @pytest.mark.parametrize("prior", [MarkovPrior(3, 0), MarkovPrior(3, 1, num_contexts=2)])
 def test_transition_matrix_refuses(prior):
     with refuses("transition_matrix"):
         prior.transition_matrix()
-
-
-def test_sampling_goes_on_past_the_training_length():
-    prior = MarkovPrior(3, 2).fit(torch.randint(3, (50, 3), generator=seeded(0)))
-    plans = prior.sample(30_000, 6, generator=seeded(1))
-    assert fits(plans, distribution(prior, 6), 3)
-
-
-def test_uniform():
-    prior = UniformPrior(5)
-    torch.testing.assert_close(distribution(prior, 3), torch.full((125,), 1 / 125, dtype=torch.double))
-    assert prior.fit(torch.randint(5, (3, 2), generator=seeded(0))) is prior
-    assert fits(prior.sample(20_000, 2, generator=seeded(0)), torch.ones(25), 5)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "word"),
-    [
-        ({"num_actions": 0}, "num_actions"),
-        ({"num_actions": 2.0}, "num_actions"),
-        ({"order": -1}, "order"),
-        ({"order": 1.5}, "order"),
-        ({"smoothing": 0}, "smoothing"),
-        ({"smoothing": -1.0}, "smoothing"),
-        ({"smoothing": float("nan")}, "smoothing"),
-        ({"smoothing": float("inf")}, "smoothing"),
-        ({"initial": "both"}, "initial"),
-        ({"num_contexts": 0}, "num_contexts"),
-        ({"backoff": "good-turing"}, "backoff"),
-    ],
-)
-def test_refuses_arguments(arguments, word):
-    with refuses(word):
-        MarkovPrior(**({"num_actions": 3} | arguments))

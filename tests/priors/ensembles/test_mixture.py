@@ -6,7 +6,7 @@ from functools import cache
 import pytest
 import torch
 
-from neuroprior import ContextTreePrior, GRUPrior, MarkovPrior, Plans, TransformerPrior, UniformPrior, load, save
+from neuroprior import ContextTreePrior, GRUPrior, MarkovPrior, Plans, TransformerPrior, UniformPrior
 from neuroprior.priors import MixturePrior, StackedPrior
 from neuroprior.priors.learning import split_validation
 from neuroprior.testing import check_prior
@@ -100,24 +100,6 @@ def test_weights_are_learned_on_plans_that_the_experts_did_not_see():
         assert expert.log_prob(plans).equal(MarkovPrior(A, k).fit(plans).log_prob(plans))
 
 
-def test_the_same_seed_gives_the_same_mixture():
-    plans, found = some_plans(), []
-    for seed in (3, 3, 4):
-        mixture = MixturePrior(A, [GRUPrior(A, 4, dropout=0.5), MarkovPrior(A, 1)])
-        mixture.fit(plans, generator=seeded(seed), max_steps=3, batch_size=8, progress=False)
-        found.append(mixture.log_prob(plans))
-    assert found[0].equal(found[1])
-    assert not found[0].equal(found[2])
-
-
-def test_a_share_is_learned_where_the_best_expert_changes():
-    one, two = (MarkovPrior(A, 0).fit(torch.full((4, 20), action)) for action in (0, 1))
-    switching = (torch.arange(400).view(10, 40) // 10) % 2
-    mixture = MixturePrior(A, [one, two])
-    mixture.learn_weights(Plans(switching, A))
-    assert 0 < mixture.share < 0.5
-
-
 def test_what_is_beyond_the_ends_of_plans_has_no_weight():
     one, two = (MarkovPrior(A, 0).fit(torch.full((4, 20), action)) for action in (0, 1))
     switching = ((torch.arange(80).view(5, 16) // 4) % 3 == 2).long()  # more often 0 than 1
@@ -129,16 +111,6 @@ def test_what_is_beyond_the_ends_of_plans_has_no_weight():
     assert learned[0][0] == learned[1][0]
     assert learned[0][1] == pytest.approx(learned[1][1], abs=1e-5)
     assert learned[0][0] > 0
-
-
-def test_it_is_saved_and_loaded(tmp_path):
-    plans = some_plans(contexts=4)
-    made = [MarkovPrior(A, 2, num_contexts=4), GRUPrior(A, 8, num_contexts=4), StackedPrior(A, 8, num_contexts=4)]
-    prior = MixturePrior(A, made).fit(plans, generator=seeded(0), max_steps=5, progress=False)
-    again = load(save(prior, tmp_path / "mixture"))
-    assert isinstance(again, MixturePrior)
-    assert again.share == prior.share
-    assert again.log_prob(plans).equal(prior.log_prob(plans))
 
 
 @pytest.mark.parametrize(

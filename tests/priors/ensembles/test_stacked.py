@@ -116,24 +116,6 @@ def test_it_learns_what_counts_cannot_hold():
     assert best > 1.4
 
 
-def test_it_is_saved_and_loaded(tmp_path):
-    plans = some_plans()
-    prior = fitted(plans, True)
-    again = load(save(prior, tmp_path / "stacked"))
-    assert again.log_prob(plans).equal(prior.log_prob(plans))
-    assert again.config == prior.config
-    same = fitted(plans, True)
-    assert all(a.equal(b) for a, b in zip(prior.state_dict().values(), same.state_dict().values(), strict=True))
-
-
-def test_long_plans_and_a_single_one():
-    """Past the training window the hidden state is carried on; a single plan is cut in parts."""
-    one = Plans(torch.randint(A, (1, 300), generator=seeded(3)), A)
-    prior = fitted(one, False, window=16)
-    assert prior.action_log_probs(one).shape == (1, 300)
-    assert prior.mixer.window is None
-
-
 @pytest.mark.parametrize(
     ("plans", "word"),
     [

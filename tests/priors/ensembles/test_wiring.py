@@ -1,6 +1,5 @@
 """What ensembles pass on to their experts and networks, what they choose, and weights worked out by hand."""
 
-from itertools import permutations
 from typing import Any
 
 import pytest
@@ -13,7 +12,6 @@ from neuroprior.priors.ensembles import stacked
 from neuroprior.priors.ensembles.candidates import NETWORKS, ORDERS, best_chain, counting_parts, fitted_experts
 from neuroprior.priors.ensembles.mixture import SHARES
 from neuroprior.priors.ensembles.pooling import HeldOut
-from neuroprior.priors.learning import split_validation
 from tests.support.sources import seeded
 
 A = 3
@@ -181,46 +179,12 @@ def test_of_many_plans_a_network_has_to_be_clearly_better_too():
         assert list(prior.experts) == kept
 
 
-def test_groups_stay_together_where_they_are_many():
-    for number, whole in ((40, True), (20, True), (4, False)):
-        plans = some_plans(80, group=torch.arange(80) % number)
-        parts = split_validation(plans, None, seeded(0))
-        assert all((part.group is not None) == whole for part in parts)
-        if whole:
-            assert not set(parts[0].group.tolist()) & set(parts[1].group.tolist())
-            assert len(parts[1].group.unique()) == number // 10
-
-
 def test_powers_of_experts_that_say_the_same_are_even():
     """Nothing speaks for any: the price alone decides, which is that of being away from the geometric mean."""
     actions = drawn([0.3, 0.3, 0.4], 4, 5)
     forecasts = torch.full((4, 5, 3, A), 1 / A).log()
     held_out = HeldOut(forecasts, actions, torch.ones(4, 5, dtype=torch.bool), 5)
     assert held_out.powers(held_out.sample).tolist() == pytest.approx([1 / 3] * 3, abs=1e-6)
-
-
-def alternating(num: int = 30, length: int = 5) -> tuple[list[Prior], Plans]:
-    """Two experts, and plans of which a third are the one's and two thirds the other's."""
-    one, two = [0.7, 0.2, 0.1], [0.1, 0.2, 0.7]
-    actions = torch.cat([drawn(one, num, length, 1), drawn(two, 2 * num, length, 2)])
-    return [independent(one), independent(two)], Plans(actions, A)
-
-
-def test_initial_weights_are_those_of_whole_plans():
-    """No little weight taken from one forecast and given to another makes the held-out plans likelier."""
-    experts, plans = alternating()
-    prior = CombinedPrior(A, experts)
-    prior.learn_weights(plans)
-    best, first = float(prior.log_prob(plans).sum()), prior.first.clone()
-    least = 1 / prior.tried
-    assert float(first.exp().min()) >= least - 1e-5
-    for source, target in permutations(range(len(first)), 2):
-        weights = first.exp()
-        moved = min(0.02, float(weights[source]) - least)
-        if moved > 1e-3:
-            weights[source], weights[target] = weights[source] - moved, weights[target] + moved
-            prior.first = weights.log()
-            assert float(prior.log_prob(plans).sum()) < best + 1e-3
 
 
 def test_a_fixed_share_that_gains_nothing_is_left_out():
@@ -248,6 +212,13 @@ def test_no_other_share_is_likelier(seed):
         assert float(mixture.log_prob(plans).sum()) <= best + 1e-4
 
 
+def alternating(num: int = 30, length: int = 5) -> tuple[list[Prior], Plans]:
+    """Two experts, and plans of which a third are the one's and two thirds the other's."""
+    one, two = [0.7, 0.2, 0.1], [0.1, 0.2, 0.7]
+    actions = torch.cat([drawn(one, num, length, 1), drawn(two, 2 * num, length, 2)])
+    return [independent(one), independent(two)], Plans(actions, A)
+
+
 def test_weights_of_whole_plans_do_not_depend_on_what_is_beyond_their_ends():
     """Where each plan is one expert's: what pads the plans is the other's."""
     experts, plans = alternating(8, 16)
@@ -271,18 +242,6 @@ def test_the_network_of_a_stacked_prior_is_trained_as_asked_else_by_its_own_defa
     prior.fit(some_plans(), generator=generator, **given)
     assert seen == {"batch_size": 64, "learning_rate": 4e-3, "generator": generator} | given
     assert prior.mixer.window is None
-
-
-def test_the_parts_on_which_experts_forecast_are_drawn():
-    found = []
-    for seed in (0, 0, 1):
-        prior = StackedPrior(A, 8, orders=(1,), depth=2)
-        monkey: list[Plans] = []
-        prior.mixer.fit = lambda plans, found=monkey, **how: found.append(plans)
-        prior.fit(some_plans(), generator=seeded(seed))
-        found.append(monkey[0].context)
-    assert found[0].equal(found[1])
-    assert not found[0].equal(found[2])
 
 
 def test_a_stacked_prior_reads_many_plans_in_parts(monkeypatch):
