@@ -194,6 +194,18 @@ def test_earlier_sequences_are_handed_on(tmp_path):
     assert not adapted.log_prob(new).allclose(prior.log_prob(new))
 
 
+def test_experts_of_an_ensemble_begin_with_what_was_counted():
+    """Each follows the individual, and the mixture with them; what counts nothing stays as it was."""
+    chain, urn = MarkovPrior(3, 1).fit(SKEWED), AdaptivePrior(UniformPrior(3), [2.0])
+    mixture = MixturePrior(3, [chain, urn])
+    some, new = Plans(torch.tensor([[0, 2, 2, 1], [2, 0, 1, 1]]), 3, torch.tensor([4, 1])), torch.tensor([[2, 2, 1]])
+    due = MixturePrior(3, [chain, adapt(urn, some)])
+    assert adapt(mixture, some).log_prob(new).allclose(due.log_prob(new))
+    assert not due.log_prob(new).allclose(mixture.log_prob(new))
+    with refuses("`prior` must learn along a sequence", "MarkovPrior does not"):
+        adapt(chain, some)
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
