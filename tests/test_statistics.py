@@ -45,6 +45,15 @@ def test_paired_difference():
     assert paired_difference([3.0] * 5, [1.0] * 5) == (2, 2, 2, 2 * 0.5**5)
 
 
+def test_a_ratio_of_sums_by_hand():
+    """Residuals -1.2, -1.8 and 3 about 12 / 15; t(0.975, 2) = 4.3027. With equal sizes it is the mean's interval."""
+    found, error = ratio_difference([2, 3, 7], [4, 6, 5]), (1.5 * (1.44 + 3.24 + 9)) ** 0.5 / 15
+    assert found[:3] == pytest.approx((0.8, 0.8 - 4.302653 * error, 0.8 + 4.302653 * error))
+    assert found.p_value == pytest.approx(2 * stats.t.sf(0.8 / error, 2))
+    # one of the units has just the ratio of all
+    assert ratio_difference([1, 2, 3], [10, 10, 10])[:3] == pytest.approx([v / 10 for v in mean_interval([1, 2, 3])])
+
+
 def test_holm_by_hand():
     """Of all tests, or of the smallest of more; each at least its own, at most 1, and in the order given."""
     assert holm([0.04, 0.01, 0.03]).tolist() == pytest.approx([0.06, 0.03, 0.06])

@@ -223,6 +223,8 @@ def test_results_of_another_command_are_kept(tmp_path, monkeypatch, capsys):
     assert main(["score", "model", "plans.npz", "--out", "kept"]) == 2
     assert "without results of another command, got kept: report" in capsys.readouterr().err
     assert {path.name for path in Path("kept").iterdir()} == before
+    Path("kept/report.html").unlink()  # one of them is enough
+    assert main(["score", "model", "plans.npz", "--out", "kept"]) == 2
     assert list(Path("kept/figures").glob("*.svg"))
     assert main(["report", *quick, "--out", "kept"]) == 0
     assert not list(Path("kept/figures").glob("*.svg"))  # they were of the run before
