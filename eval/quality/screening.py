@@ -90,7 +90,7 @@ def rows_of(job: Job, num_sequences: int) -> list[dict[str, Any]]:
     contexts, settings = context_arguments(plans), {"progress": False}
     experts = list(counted(learned, held_out, contexts))
     counts, of_test = stack_forecasts(experts, held_out), stack_forecasts(experts, test)
-    forecasts, rows = counts, []
+    forecasts, rows = counts, list[dict[str, Any]]()
     for network in networks(plans.num_actions, contexts, "standard", job.seed + 1).values():
         begun = time.perf_counter()
         promise = screen(network, counts, learned, held_out, settings)
