@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from neuroprior._jobs import JobRun
-from neuroprior.behaviour.analysis.comparison import Score, action_bits, baselines, score_bits
-from neuroprior.behaviour.reporting.fits import ACTIONS, CONTEXT, Arrays
+from neuroprior.behaviour.analysis.comparison import ACTIONS, CONTEXT, Score, action_bits, baselines, score_bits
+from neuroprior.behaviour.reporting.fits import Arrays
 from neuroprior.behaviour.reporting.scores import load_arrays, save_arrays
 from neuroprior.cli.fit_data import Parts
 from neuroprior.plans import Plans

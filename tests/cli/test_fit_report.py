@@ -123,8 +123,8 @@ def test_folds_are_those_of_the_seed(tmp_path):
     for name, bits in due.items():
         by_group = [float(bits[plans.group == g].sum()) for g in range(7)]
         assert found[name].bits.tolist() == pytest.approx(by_group, rel=1e-4)
-    assert found["trained"].inputs == "actions"
-    assert found["markov-1"].inputs == "actions and context"
+    assert found["trained"].inputs == "behaviours"
+    assert found["markov-1"].inputs == "behaviours and context"
     # Finished folds are read again, where prior, seed and context are the same.
     others = [(MarkovPrior(3, 1), how, 3), (fresh, how | {"seed": 5}, 3), (fresh, how, 4)]
     for number, (prior, options, contexts) in enumerate([(fresh, how, 3), *others], 1):

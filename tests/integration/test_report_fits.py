@@ -58,12 +58,12 @@ def test_the_entropy_rate_is_reached(tmp_path):
     assert results["unit"] == "sequences"
     assert results["file"] | {"name": ""} == {
         "name": "",
-        "plans": 400,
-        "actions": 12000,
+        "sequences": 400,
+        "behaviours": 12000,
         "shortest": 30,
         "longest": 30,
-        "kinds of actions": 3,
-        "groups": 0,
+        "kinds": 3,
+        "subjects": 0,
         "conditions": 0,
         "durations": False,
         "notes": [],
@@ -82,7 +82,7 @@ def test_a_planted_difference_of_groups_is_found(tmp_path):
     cells = [row for row in results["transitions"] if row["subject"] != "all"]
     assert min(row["p_value"] for row in cells) == pytest.approx(0.001)
     (test,) = results["transition_test"]
-    assert (test["groups"], test["test"]) == (4, "permutation")
+    assert (test["subjects"], test["test"]) == (4, "permutation")
     assert test["p_value"] == pytest.approx(0.001)
     counts = torch.zeros(3, 3)
     for a, b in zip(plans.actions[:, :-1].flatten().tolist(), plans.actions[:, 1:].flatten().tolist(), strict=True):

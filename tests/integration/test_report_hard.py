@@ -62,7 +62,7 @@ def test_hard_files_have_a_report(what, tmp_path, recwarn):
     assert found["uniform"] == pytest.approx(math.log2(plans.num_actions - closed), abs=1e-6)
     assert len(found) == 9
     lengths = plans.mask().sum(1) - closed
-    assert results["file"]["actions"] == int(lengths.sum())
+    assert results["file"]["behaviours"] == int(lengths.sum())
     assert results["settings"].get("sequences without behaviours, left out", 0) == int((lengths == 0).sum())
     assert not [warning.message for warning in recwarn if "neuroprior" in str(warning.filename)]
 
@@ -128,8 +128,8 @@ def test_a_csv_file_of_names(tmp_path):
     assert main(["plans", str(tmp_path / "new.csv"), "--out", str(tmp_path / "out"), *QUICKLY, "--folds", "2"]) == 0
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     assert results["unit"] == "subjects"
-    assert results["file"]["groups"] == 4
-    assert results["file"]["actions"] == 24 * 2 + 8
+    assert results["file"]["subjects"] == 4
+    assert results["file"]["behaviours"] == 24 * 2 + 8
     assert {row["name"] for row in results["drift"] if row["what"] == "group"} == {f"mouse {n}" for n in range(4)}
     on = [r for r in results["transitions"] if (r["group"], r["from"]) == ("all", "on")]
     assert [(row["to"], row["count"], row["probability"]) for row in on] == [("left", 8, 1)]

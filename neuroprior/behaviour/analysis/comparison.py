@@ -19,6 +19,9 @@ from neuroprior.priors.counts import Chains, TooLargeError
 from neuroprior.priors.ensembles.candidates import DEPTH, ORDERS
 from neuroprior.priors.learning import plans_for
 
+ACTIONS, CONTEXT, DURATIONS = "behaviours", "behaviours and context", "behaviours and durations"
+"""The input of a model, in the words of reports; durations are those of past actions."""
+
 
 @dataclass(frozen=True)
 class Score:
@@ -26,7 +29,7 @@ class Score:
 
     Attributes:
         model: the prior's name.
-        inputs: what it predicts from, "actions" or "actions and context".
+        inputs: what it predicts from, `ACTIONS` or `CONTEXT`.
         bits: `[G]`, float64: the negative log2-likelihood of each independent unit.
         actions: `[G]`, float64: the number of actions in each unit.
         digest: of the actions that were scored; scores of others are not compared.
@@ -72,7 +75,7 @@ def score(model: str, prior: Prior, plans: Plans) -> Score:
         1.585
     """
     bits = action_bits(prior, plans)
-    inputs = "actions and context" if prior.takes_context else "actions"
+    inputs = CONTEXT if prior.takes_context else ACTIONS
     return score_bits(model, inputs, bits, plans)
 
 
@@ -81,7 +84,7 @@ def score_bits(model: str, inputs: str, bits: Tensor, plans: Plans, mask: Tensor
 
     Args:
         model: its name.
-        inputs: "actions", or "actions and context".
+        inputs: `ACTIONS` or `CONTEXT`.
         bits: `[N, L]`, the negative log2-probability of each action.
         plans: the held-out plans, which define the units.
         mask: `[N, L]` bool: the actions that count; None: all.

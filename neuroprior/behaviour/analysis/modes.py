@@ -15,7 +15,7 @@ from torch import Tensor
 
 from neuroprior._checks import as_list, check_sizes
 from neuroprior._random import draw_seed, generator_on
-from neuroprior.behaviour.analysis.comparison import Score, action_bits, score_bits
+from neuroprior.behaviour.analysis.comparison import ACTIONS, CONTEXT, Score, action_bits, score_bits
 from neuroprior.plans import Plans, constant_context
 from neuroprior.plans.folds import FEWEST_UNITS, FOLDS, divisible, folds, num_units
 from neuroprior.plans.plans import AnyPlans, check_are_plans
@@ -139,7 +139,7 @@ def choose_modes(
         raise ValueError(f"`mask` must be bool of shape {shape}, got {mask.dtype} {list(mask.shape)}.")
     mask = given.mask() if mask is None else given.mask() & mask
     scores, priors, stability = {}, {}, {}
-    inputs = "actions" if given.context is None else "actions and context"
+    inputs = ACTIONS if given.context is None else CONTEXT
     for number in numbers:
         make = partial(SwitchingPrior, num_modes=number, **arguments)
 

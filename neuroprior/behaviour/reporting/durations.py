@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neuroprior._statistics import LEVEL, holm, ratio_difference
-from neuroprior.behaviour.analysis.comparison import Score, score_bits, too_few, unit_name
+from neuroprior.behaviour.analysis.comparison import ACTIONS, DURATIONS, Score, score_bits, too_few, unit_name
 from neuroprior.behaviour.analysis.lags import MAX_FOLDS, actions_in_a_row, bits_after, bits_held_out, bits_of_shares
 from neuroprior.behaviour.durations.duration_model import DurationModel
 from neuroprior.behaviour.durations.laws import resolution
@@ -18,7 +18,6 @@ from neuroprior.behaviour.recorded_plans import RecordedPlans, action_names, dur
 from neuroprior.behaviour.reporting import figures
 from neuroprior.behaviour.reporting.document import Column, table
 from neuroprior.behaviour.reporting.findings import gain_finding
-from neuroprior.behaviour.reporting.fits import ACTIONS, DURATIONS
 from neuroprior.behaviour.reporting.page import FigureBox, Section
 from neuroprior.behaviour.reporting.part import LISTED, Part, p_text, without_verdict
 from neuroprior.behaviour.reporting.scores import Evaluation

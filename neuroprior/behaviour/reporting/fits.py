@@ -10,7 +10,15 @@ import torch
 from torch import Tensor
 
 from neuroprior._version import __version__
-from neuroprior.behaviour.analysis.comparison import Score, action_bits, baselines, score_bits
+from neuroprior.behaviour.analysis.comparison import (
+    ACTIONS,
+    CONTEXT,
+    DURATIONS,
+    Score,
+    action_bits,
+    baselines,
+    score_bits,
+)
 from neuroprior.behaviour.analysis.lags import pieces
 from neuroprior.behaviour.durations.past_durations import PastDurations
 from neuroprior.plans import Plans
@@ -24,9 +32,6 @@ from neuroprior.priors.ensembles.screening import Screening
 from neuroprior.priors.learning import plans_for, split_validation
 
 Arrays = dict[str, np.ndarray[Any, Any]]
-
-ACTIONS, CONTEXT, DURATIONS = "behaviours", "behaviours and context", "behaviours and durations"
-"""The input of a model; durations are those of past actions."""
 
 WITH = {ACTIONS: "", CONTEXT: ", with context", DURATIONS: ", with durations"}
 """The inputs in the order of tables, and what names of models say of them."""

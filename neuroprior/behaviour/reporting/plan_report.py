@@ -13,6 +13,7 @@ from neuroprior._checks import check_choices, check_count
 from neuroprior._folders import claim, claim_out
 from neuroprior._jobs import Progress, in_words, saying
 from neuroprior._threads import one_thread
+from neuroprior.behaviour.analysis.comparison import ACTIONS, CONTEXT, DURATIONS
 from neuroprior.behaviour.durations.past_durations import PastDurations
 from neuroprior.behaviour.reading.read import read_recordings
 from neuroprior.behaviour.recorded_plans import RecordedPlans
@@ -27,12 +28,9 @@ from neuroprior.behaviour.reporting.document import (
 )
 from neuroprior.behaviour.reporting.findings import headline
 from neuroprior.behaviour.reporting.fits import (
-    ACTIONS,
     COMBINED,
-    CONTEXT,
     COSTS,
     COUNTS,
-    DURATIONS,
     LAGS,
     OF_FEATURES,
     Design,

@@ -15,18 +15,24 @@ from torch import Tensor
 
 from neuroprior._files import written_whole
 from neuroprior._jobs import JobRun
-from neuroprior.behaviour.analysis.comparison import Score, action_bits, score_bits, too_few, unit_name
+from neuroprior.behaviour.analysis.comparison import (
+    ACTIONS,
+    CONTEXT,
+    DURATIONS,
+    Score,
+    action_bits,
+    score_bits,
+    too_few,
+    unit_name,
+)
 from neuroprior.behaviour.analysis.transitions import Transitions, transitions
 from neuroprior.behaviour.durations.past_durations import PastDurations
 from neuroprior.behaviour.recorded_plans import RecordedPlans
 from neuroprior.behaviour.recordings import Recordings
 from neuroprior.behaviour.reporting import fits
 from neuroprior.behaviour.reporting.fits import (
-    ACTIONS,
     COMBINED,
-    CONTEXT,
     COUNTED,
-    DURATIONS,
     KINDS,
     LAGS,
     OF_FEATURES,

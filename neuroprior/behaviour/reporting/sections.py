@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from neuroprior._statistics import ENOUGH_UNITS, LEVEL, p_words
-from neuroprior.behaviour.analysis.comparison import never_occur, never_taken, too_few, unit_name, units
+from neuroprior.behaviour.analysis.comparison import ACTIONS, never_occur, never_taken, too_few, unit_name, units
 from neuroprior.behaviour.analysis.drift import by_group, by_plan, by_position
 from neuroprior.behaviour.analysis.lags import how_far_back
 from neuroprior.behaviour.analysis.motifs import motifs
@@ -21,7 +21,6 @@ from neuroprior.behaviour.reporting.conditions import condition_section
 from neuroprior.behaviour.reporting.document import Column, table
 from neuroprior.behaviour.reporting.durations import duration_section
 from neuroprior.behaviour.reporting.findings import Finding, gain_finding
-from neuroprior.behaviour.reporting.fits import ACTIONS
 from neuroprior.behaviour.reporting.individuals import individual_section
 from neuroprior.behaviour.reporting.modes import mode_section
 from neuroprior.behaviour.reporting.page import FigureBox, Section, Table

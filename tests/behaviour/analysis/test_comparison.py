@@ -84,7 +84,7 @@ def test_score_is_what_log_prob_says(kind, per):
     keep = plans.lengths > 0
     bits = -prior.log_prob(plans).detach().double()[keep] / math.log(2)
     assert found.model == "it"
-    assert found.inputs == ("actions" if per is None else "actions and context")
+    assert found.inputs == ("behaviours" if per is None else "behaviours and context")
     torch.testing.assert_close(found.bits, bits, rtol=1e-5, atol=1e-6)
     assert found.actions.tolist() == plans.lengths[keep].tolist()
     assert found.bits.dtype == found.actions.dtype == torch.float64

@@ -4,13 +4,13 @@ import csv
 import json
 import re
 import warnings
+from contextlib import redirect_stdout
 from io import StringIO
 
 import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.colors import to_hex
-from rich.console import Console
 
 from eval.compare import figures
 from eval.compare.report import FRAMES, document
@@ -29,12 +29,12 @@ STYLE = figures.styles(["uniform", "markov-0", "markov-1", "markov-2", "gru", "t
 
 def reported(runs, folder, asked=ASKED) -> tuple[dict, str, str]:
     """What `results.json` holds, the page, and what was printed; warnings are errors."""
-    console = Console(width=80, file=StringIO())
-    with warnings.catch_warnings():
+    printed = StringIO()
+    with warnings.catch_warnings(), redirect_stdout(printed):
         warnings.simplefilter("error")
-        publish(document(Results(runs, asked), SETTINGS, "python -m eval compare"), folder, console)
+        publish(document(Results(runs, asked), SETTINGS, "python -m eval compare"), folder)
     results = json.loads((folder / "results.json").read_text())
-    return results, (folder / "report.html").read_text(), console.file.getvalue()
+    return results, (folder / "report.html").read_text(), printed.getvalue()
 
 
 @pytest.fixture(scope="module")
