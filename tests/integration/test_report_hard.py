@@ -130,6 +130,6 @@ def test_a_csv_file_of_names(tmp_path):
     assert results["unit"] == "subjects"
     assert results["file"]["subjects"] == 4
     assert results["file"]["behaviours"] == 24 * 2 + 8
-    assert {row["name"] for row in results["drift"] if row["what"] == "group"} == {f"mouse {n}" for n in range(4)}
-    on = [r for r in results["transitions"] if (r["group"], r["from"]) == ("all", "on")]
+    assert {row["name"] for row in results["drift"] if row["what"] == "subject"} == {f"mouse {n}" for n in range(4)}
+    on = [r for r in results["transitions"] if (r["subject"], r["from"]) == ("all", "on")]
     assert [(row["to"], row["count"], row["probability"]) for row in on] == [("left", 8, 1)]
