@@ -11,7 +11,7 @@ import torch
 
 from neuroprior._jobs import JobRun
 from neuroprior.behaviour.analysis.comparison import Score, action_bits, baselines, score_bits
-from neuroprior.behaviour.reporting.fits import ACTIONS, CONTEXT, Arrays
+from neuroprior.behaviour.reporting.fits import Arrays
 from neuroprior.behaviour.reporting.scores import load_arrays, save_arrays
 from neuroprior.cli.fit_data import Parts
 from neuroprior.plans import Plans
@@ -58,7 +58,7 @@ def cross_validated(
             for index, arrays in zip(held_out, found, strict=True):
                 bits[index] = torch.from_numpy(arrays[f"{name}/bits"])
             takes = any(bool(arrays[f"{name}/context"]) for arrays in found)
-            scores[name] = score_bits(name, CONTEXT if takes else ACTIONS, bits, data.plans)
+            scores[name] = score_bits(name, "actions and context" if takes else "actions", bits, data.plans)
     return scores
 
 
