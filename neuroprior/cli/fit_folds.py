@@ -17,7 +17,7 @@ from neuroprior.cli.fit_data import Parts
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import divisible, fair_split, folds
 from neuroprior.plans.sequences import plans_digest
-from neuroprior.priors import Prior
+from neuroprior.priors import CombinedPrior, Prior
 from neuroprior.priors.learning import plans_for
 
 TRAINED = "trained"
@@ -48,7 +48,8 @@ def cross_validated(
     asked |= {"folds": data.folds, "validation": data.validation, "num_contexts": num_contexts}
     run = JobRun(fit, folder / "folds", asked, name="fold{}".format, save=save_arrays, load=load_arrays, suffix=".npz")
     # Counting takes less time than starting processes; and these cannot share a GPU's memory.
-    alone = not prior.fit_settings or prior.device.type != "cpu"
+    counts = not prior.fit_settings or (isinstance(prior, CombinedPrior) and prior.networks == ())
+    alone = counts or prior.device.type != "cpu"
     found = run.do(range(data.folds), processes=1 if alone else None, title="folds")
     held_out = [index for _, index in folds(data.plans, data.folds, data.seed)]
     scores = {}
