@@ -252,7 +252,7 @@ def _cross_validate(
         return replace(found, plans=whole, settings=settings | found.settings | more)
 
     def fitting(some: list[Job]) -> Iterator[_Stage]:
-        counting = all(job.networks == () for job in some)  # which takes less time than starting processes
+        counting = some and all(job.networks == () for job in some)  # takes less time than starting processes
         how: dict[str, Any] = {"processes": 1 if counting else fits.processes, "dask": fits.dask, "title": "networks"}
         for seconds in run.each(some, cost=lambda job: COSTS[job.kind], **how):
             yield _Stage(found, (), _still(f"networks (about {in_words(seconds)} more)", *later[1:]))
