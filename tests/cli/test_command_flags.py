@@ -71,7 +71,7 @@ SPLIT = LEARNED | {"baselines": ..., "not held out": ...}
 TRAINED = LEARNED | {"curve": ...}
 DRIFT = {"scores": ..., "drift": ..., "drift_tests": ...}
 SCORED = DRIFT | {"headline": ...}
-CHANGED = SCORED | {"lags": ..., "reference": "context tree (behaviours)"}
+CHANGED = SCORED | {"lags": ..., "reference": "context tree"}
 CONFIG = ("base", "beta", "depth", "backoff", "initial", "order", "smoothing")
 TREE = {f"config.{name}": ... for name in CONFIG} | {"prior": "ContextTreePrior", "config.depth": 10}
 
@@ -113,7 +113,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [
     (COUNTS, "test ../more.csv", CHANGED | {"settings.test": "more.csv", "settings.folds": 1}),
     (COUNTS, "folds 3", CHANGED | {"settings.folds": 3}),
     (COUNTS, "skip 2", SCORED | {
-        "settings.skip": 2, "how_far_back": ..., "findings": ..., "reference": "context tree (behaviours)",
+        "settings.skip": 2, "how_far_back": ..., "findings": ..., "reference": "context tree",
     }),
     (COUNTS, "seed 1", CHANGED | {"settings.seed": 1}),
     (COUNTS, "modes 1 2", {"settings.modes": [1, 2], "modes": [1, 2], "files": ...}),
@@ -124,7 +124,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [
     }),
     (COUNTS, "out there", {"folders": ["there"]}),
     (COUNTS, "inputs actions context", CHANGED | {
-        "inputs": ["behaviours", "behaviours and context"], "reference": "context tree (behaviours and context)",
+        "inputs": ["behaviours", "behaviours and context"], "reference": "context tree, with context",
         "models": ...,
     }),
     (COUNTS, "models counts gru", {

@@ -99,7 +99,7 @@ def test_the_report_compares_conditions_by_modes():
     plans = RecordedPlans(actions, 3, group=group, condition=often[:, 0], condition_names=("control", "treated"))
     made = of_modes(plans, 2)
     tests = made.frames["mode_condition_tests"].set_index("test")
-    assert tests.loc["actions", "p_value"] < 0.05
+    assert tests.loc["behaviours", "p_value"] < 0.05
     assert "mode_conditions" in made.figures
     features = made.frames["mode_conditions"]
     assert any("mode 2" in str(name) for name in features["feature"])

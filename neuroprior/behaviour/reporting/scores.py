@@ -182,7 +182,7 @@ def evaluate(
     best = min(models, key=lambda model: model.cost, default=None)
     gains.sort(key=lambda row: (row["input"] == CONTEXT, row["model"] != COUNTED))
     table = pd.DataFrame(gains)
-    reference = None if best is None else (best, f"{best.name} ({best.inputs})")
+    reference = None if best is None else (best, best.label)
     return Evaluation(plans, scored, mask, models, reference, scored[held_out[0]], table, asdict(design), promises)
 
 

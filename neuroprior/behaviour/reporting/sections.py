@@ -112,7 +112,7 @@ def score_section(found: Evaluation) -> Part | None:
     learned, saved = found.settings.get("training data", {}), "priors" in found.settings
     columns: Mapping[str, Column] = {
         "model": lambda row: f"{row.model} (training data)" if row.model in learned else str(row.model),
-        "input": _input,
+        **({"input": _input} if scores["input"].nunique() > 1 else {}),
         "nats": "nats_per_behaviour:.4f",
         "bits per\nbehaviour": lambda row: f"{row.bits_per_behaviour:.4f}±{row.high - row.bits_per_behaviour:.4f}",
         "perpl.": "perplexity:.3f",
@@ -145,7 +145,7 @@ def score_section(found: Evaluation) -> Part | None:
     alt = f"Bits per behaviour of each model, the fewest {best.cost:.3f} of {best.label}."
     box = FigureBox(figures.score_figure(scores), caption_of_figure, alt, "scores")
     title = "Scores" if saved else "Held-out scores"
-    shown = table(scores, columns, caption, align="llrrrr")
+    shown = table(scores, columns, caption, align="l" * (len(columns) - 4) + "rrrr")
     return Part(Section(title, text, [shown], [box]), {"scores": scores})
 
 

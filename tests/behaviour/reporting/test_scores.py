@@ -100,7 +100,7 @@ def test_the_results_of_folds_are_put_together():
     assert made.first_fold.actions.equal(PLANS.actions[held_out[0]])
     assert made.mask.equal(torch.arange(4).expand(6, 4) >= 1)
     assert tree.cost == pytest.approx(1)  # as many plans in each fold: the mean of 0, 1 and 2
-    assert made.reference == (tree, "context tree (behaviours)")
+    assert made.reference == (tree, "context tree")
     assert made.settings["folds"] == 3
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from neuroprior.control import AutoregressivePrior, NoisePrior, StoredWindows, VectorGRU, VectorPlans
+from neuroprior.control import AutoregressivePrior, NoisePrior, StoredWindows, VectorGRU, VectorPlans, VectorPrior
+from neuroprior.priors import load, save
 from neuroprior.testing import check_prior
 from tests.support.sources import seeded
 
@@ -40,6 +41,15 @@ def test_conformance_between_any_bounds(kind, bounds):
     plans = source(*bounds)
     prior = CLOSED[kind](plans.action_low, plans.action_high).fit(plans, generator=seeded(0))
     check_prior(prior, length=3, num_plans=400)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_vectors_of_one_number_are_saved(kind, tmp_path):
+    plans = source(-2.0, 5.0)
+    prior = KINDS[kind](plans.action_low, plans.action_high)
+    prior.fit(plans, generator=seeded(0), **({"max_steps": 2, "progress": False} if kind == "gru" else {}))
+    again = load(save(prior, tmp_path), kind=VectorPrior)
+    assert again.action_log_probs(plans).equal(prior.action_log_probs(plans))
 
 
 @pytest.mark.parametrize("kind", CLOSED)
