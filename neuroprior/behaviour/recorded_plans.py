@@ -307,7 +307,11 @@ def _design_fields(
     factor = compare or (several or list(factors))[0]
     levels = sorted(pd.unique(first[factor]), key=str)
     if "" in levels:
-        raise ValueError(f"`compare` must be known for each recording, got empty cells of {factor!r}")
+        subject = first["subject"][first[factor] == ""].iloc[0]
+        raise ValueError(
+            f"{factor!r}, which is compared, must be known for each recording, got an empty cell of {subject}; fill it,"
+            " or name another factor with `compare`."
+        )
     if reference is not None and reference not in levels:
         raise ValueError(f"`reference` must be one of {', '.join(levels)}, got {reference!r}")
     controls = [level for level in levels if str(level).casefold() in CONTROLS]

@@ -10,12 +10,13 @@ from rich.console import Console
 from neuroprior._folders import claim, claim_out
 from neuroprior.behaviour.analysis.comparison import score_bits, too_few, unit_name
 from neuroprior.behaviour.durations.past_durations import PastDurations
-from neuroprior.behaviour.recorded_plans import RecordedPlans
+from neuroprior.behaviour.recorded_plans import RecordedPlans, group_names
 from neuroprior.behaviour.reporting.document import printed, table, write_frames
 from neuroprior.behaviour.reporting.options import ReadOptions, is_recording, name_files
+from neuroprior.plans.columns import listed
 from neuroprior.priors import load
 from neuroprior.priors.matching import learned_names, match_plans, numbered_note, taken_note, with_contexts_of
-from neuroprior.priors.scoring import learned_from, log_probs_after, scores_by
+from neuroprior.priors.scoring import LONG_ENOUGH, are_among, learned_from, log_probs_after, plan_digests, scores_by
 
 UNITS = ("plan", "group", "condition")
 """What has a table of its own, if the plans have it."""
@@ -60,7 +61,10 @@ def score(
     if past is not None and (twice := {Path(one).resolve() for one in files} & {Path(one).resolve() for one in past}):
         raise ValueError(f"`past` must hold other files than those that are scored, got {min(twice)}.")
     plans, matched, notes = read(files)
-    earlier = None if past is None else read(past)[1]
+    earlier = None
+    if past is not None:
+        before, earlier, more = read(past)
+        notes += [f"{name_files(past)}: {note}" for note in (*before.notes, *more, *_on_past(plans, before))]
     units = [by for by in UNITS if by == "plan" or getattr(plans, by) is not None]
     with claim(place) as claimed:
         claimed.check(f"{by}s.csv" for by in units)
@@ -92,8 +96,9 @@ def score(
     console = Console(markup=False)
     for note in notes:
         console.print(f"note: {note}", highlight=False, soft_wrap=True)
+    after = "" if past is None else f" after {name_files(past)}"
     console.print(
-        printed(f"{name_files(files)} under {folder}", table(frame.head(MOST_ROWS), first | numbers, caption))
+        printed(f"{name_files(files)}{after} under {folder}", table(frame.head(MOST_ROWS), first | numbers, caption))
     )
     interval = f"95 % interval {whole.low:.4f} to {whole.high:.4f} over {unit_name(plans)}"
     few = too_few(plans)
@@ -102,3 +107,15 @@ def score(
     console.print(
         f"tables: {', '.join(str(place / f'{name}.csv') for name in frames)}", highlight=False, soft_wrap=True
     )
+
+
+def _on_past(plans: RecordedPlans, before: RecordedPlans) -> list[str]:
+    """Return notes on sequences that are scored after themselves, and on subjects without a past."""
+    notes = []
+    if again := sum(are_among(plans, {*plan_digests(before)}, LONG_ENOUGH)):
+        notes.append(f"{again:,} of {len(plans):,} scored plans are in it, too: their bits are too low")
+    if plans.group is not None and before.group is not None:
+        here, there = (set(group_names(each, group)) for each, group in ((plans, plans.group), (before, before.group)))
+        if alone := sorted(here - there):
+            notes.append(f"{len(alone)} of {len(here)} subjects are not in it, and scored alone: {listed(alone[:9])}")
+    return notes

@@ -345,12 +345,14 @@ def adapt(prior: AnyPrior, plans: Plans | Tensor) -> AnyPrior:
         >>> adapt(AdaptivePrior(UniformPrior(2), [2.0]), torch.tensor([[0, 0]])).log_prob(torch.tensor([[0]])).exp()
         tensor([0.7500])
     """
+    if not isinstance(prior, Prior):
+        raise ValueError(f"`prior` must be a fitted prior, got {type(prior).__name__}.")
     adapted = deepcopy(prior)
     parts = [part for part in adapted.modules() if isinstance(part, AdaptivePrior)]
     if not parts:
         raise ValueError(
-            f"`prior` must learn along a sequence, as an `AdaptivePrior` does, or a combined prior of sequences of a"
-            f" hundred actions or more; this {type(prior).__name__} does not."
+            f"`prior` must learn along a sequence, as an `AdaptivePrior` does (`neuroprior fit --prior adaptive`), or a"
+            f" combined prior of sequences of a hundred actions or more; this {type(prior).__name__} does not."
         )
     for part in parts:
         part.count(plans)

@@ -21,6 +21,9 @@ from neuroprior.priors.matching import match_plans
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.serialization import MODEL, digest, load
 
+LONG_ENOUGH = 20
+"""Actions from which on equal plans are thought to be the same one."""
+
 LEARNED = "learned.json"
 """In the folder of a saved prior: the digests of the plans that it has learned from, at least in part."""
 
@@ -59,6 +62,8 @@ def score(prior: Prior | str | os.PathLike[str], plans: Plans, by: str = "plan",
             f" {type(prior).__name__}"
         )
     with torch.no_grad():
+        if past is not None and not isinstance(past, Plans):
+            raise ValueError(f"`past` must be Plans, got {type(past).__name__}.")
         earlier = None if past is None else match_plans(past, prior)
         log_probs = log_probs_after(prior, match_plans(plans, prior), earlier)
     plans = plans if plans.end is None else plans.without_end()
@@ -83,11 +88,13 @@ def log_probs_after(prior: Prior, plans: Plans, past: Plans | None) -> Tensor:
     log_probs = prior.action_log_probs(plans_for(prior, plans))
     if past is None:
         return log_probs
+    past = past[past.mask().any(1)]
     if plans.group is None or past.group is None:
         raise ValueError("`past` must have groups, as `plans` must: the individuals whose counts go on.")
     groups, earlier = (np.array(_names(each, "group"), dtype=object) for each in (plans, past))
     if not (both := [name for name in dict.fromkeys(groups) if name in set(earlier)]):
-        raise ValueError("`past` must hold plans of a group of `plans`: there is none.")
+        of_plans, of_past = (", ".join(map(str, dict.fromkeys(names))) for names in (groups[:9], earlier[:9]))
+        raise ValueError(f"`past` must hold plans of groups of `plans`, such as {of_plans}; got {of_past or 'none'}.")
     for name in both:
         own, before = (torch.from_numpy(names == name) for names in (groups, earlier))
         log_probs[own] = adapt(prior, past[before]).action_log_probs(plans_for(prior, plans[own]))

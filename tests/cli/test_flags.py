@@ -112,6 +112,17 @@ def test_an_option_changes_what_it_says_and_nothing_else(option):
     pd.testing.assert_frame_equal(found[sorted(found)], expected[sorted(expected)], check_dtype=False)
 
 
+def test_a_row_in_which_nothing_was_done_ends_no_sequence():
+    """The row of `n/a` stands between two of the first session; by default what follows is another sequence."""
+    gap, nothing = (recordings(BOUTS, f"{SESSIONS} --missing {missing}") for missing in ("gap", "nothing"))
+    assert gap.plans().mask().sum(1).tolist() == [2, 1, 2]
+    assert nothing.plans().mask().sum(1).tolist() == [3, 2]
+    assert (gap.watched["stop"] - gap.watched["start"]).sum() + 1 == (
+        nothing.watched["stop"] - nothing.watched["start"]
+    ).sum()
+    assert "nothing was done in them" in " ".join(nothing.notes)
+
+
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize(
     ("table", "options"),

@@ -53,6 +53,15 @@ def test_subjects_go_on_from_their_earlier_files(tmp_path, capsys):
     assert pd.read_csv(tmp_path / "out" / "plans.csv")["log_likelihood"].tolist() == pytest.approx(
         due.tolist(), abs=1e-4
     )
+    # what is scored after itself, and by whom nothing is known, is said
+    distinct = Plans(torch.randint(3, (7, 24), generator=seeded(1)), 3, group=torch.arange(7))
+    write_plans(distinct, files[1])
+    write_plans(distinct[:3], files[0])
+    capsys.readouterr()
+    assert main(["score", folder, files[1], "--past", files[0], "--out", str(tmp_path / "out")]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "3 of 7 scored plans are in it, too" in said
+    assert "4 of 7 subjects are not in it, and scored alone: group 3, group 4, group 5 and group 6" in said
     assert main(["score", folder, files[1], "--past", files[1], "--out", str(tmp_path / "out")]) == 2
     assert "`past` must hold other files" in capsys.readouterr().err
 

@@ -204,6 +204,8 @@ def test_experts_of_an_ensemble_begin_with_what_was_counted():
     assert not due.log_prob(new).allclose(mixture.log_prob(new))
     with refuses("`prior` must learn along a sequence", "MarkovPrior does not"):
         adapt(chain, some)
+    with refuses("`prior` must be a fitted prior, got NoneType."):
+        adapt(None, some)
 
 
 @pytest.mark.parametrize(

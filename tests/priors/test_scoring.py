@@ -92,7 +92,7 @@ def test_groups_go_on_from_their_earlier_plans():
     ("prior", "past", "words"),
     [
         (AdaptivePrior(PRIOR), replace(NEW, group=None, group_names=None), "`past` must have groups"),
-        (AdaptivePrior(PRIOR), replace(NEW, group_names=("m8", "m9")), "`past` must hold plans of a group of `plans`"),
+        (AdaptivePrior(PRIOR), replace(NEW, group_names=("m8", "m9")), "such as m1, m2; got m8, m9"),
         (PRIOR, NEW, "`prior` must learn along a sequence"),
     ],
 )

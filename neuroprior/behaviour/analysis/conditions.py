@@ -327,7 +327,7 @@ def _correct_pairs(whole: ConditionComparison, pairs: list[ConditionComparison])
 
     every = correct([pair.p_value for pair in pairs], whole.p_value)
     names = [name for name in whole.tests if all(name in pair.tests for pair in pairs)]
-    of_tests = {name: correct([pair.tests[name][0] for pair in pairs], whole.tests[name][1]) for name in names}
+    of_tests = {name: correct([pair.tests[name][1] for pair in pairs], whole.tests[name][1]) for name in names}
     found = []
     for place, (pair, p_value) in enumerate(zip(pairs, every, strict=True)):
         tests = {name: (pair.tests[name][0], of_tests[name][place]) for name in names}
@@ -547,7 +547,7 @@ def _verdict(
 ) -> str:
     sizes = " against ".join(map(str, design.sizes)) if design.kind == "between" else str(len(design.units))
     units = f"{sizes} {design.item}" + " under every condition" * (design.kind == "within")
-    power = f"With {units} the smallest possible p is {smallest:.2g}"
+    power = f"With {units} the smallest possible is {p_words(smallest)}"
     if smallest >= LEVEL:
         return f"{power}: no test can find a difference."
     if not conclusive:

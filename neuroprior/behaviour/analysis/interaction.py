@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from neuroprior._random import generator_on
-from neuroprior._statistics import LEVEL
+from neuroprior._statistics import LEVEL, p_words
 from neuroprior.behaviour.analysis.permutation_design import PermutationDesign, shuffle_within
 from neuroprior.behaviour.analysis.permutation_tests import combine_tests, largest_statistics
 
@@ -120,7 +120,7 @@ def compare_strata(
         tested.append(InteractionFamily(name, features, differences, *found[:3], p_value))
     tests, p_value = combine_tests(statistics)
     enough = ", ".join(name for name, (_, corrected) in tests.items() if corrected < LEVEL)
-    where = f"the difference between conditions depends on the stratum ({', '.join(stratum_names)}; p = {p_value:.2g})"
+    where = f"the difference between conditions depends on the stratum ({', '.join(stratum_names)}; {p_words(p_value)})"
     if p_value >= LEVEL:
         verdict = f"It was not found that {where}."
     else:

@@ -145,7 +145,7 @@ def _notes_on_labels(table: Table, labels: NDArray[Any], part: Part, only_starts
     missing = labels == ""
     if missing.any():
         what = f"rows have no label (first in {table.place(int(missing.argmax()))})"
-        notes.append(f"{missing.sum():,} of {len(labels):,} {what}: another fragment begins after each")
+        notes.append(f"{missing.sum():,} of {len(labels):,} {what}: {table.after_missing}")
     part.note_repeats("behaviours", " if a row is a frame,")
     endless = part.events["stop"].isna().to_numpy() & part.events["start"].notna().to_numpy()
     if 0 < endless.sum() < len(endless) and table.options.ends != "next":

@@ -42,7 +42,7 @@ def rows_of_sequences(table: Table) -> Part:
     flat = labels[taken]
     table.unit = table.unit or "steps"
     if (flat == "").any():
-        what = "cells within sequences have no label: another fragment begins after each"
+        what = f"cells within sequences have no label: {table.after_missing}"
         table.notes.append(f"{(flat == '').sum():,} {what}")
     part = table.part(rows.astype(np.int64), flat, steps.astype(np.float64), steps + 1.0)
     part.note_repeats("cells")

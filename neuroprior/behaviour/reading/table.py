@@ -326,6 +326,11 @@ class Table:
             " read as another recording"
         )
 
+    @property
+    def after_missing(self) -> str:
+        """What notes say of rows without a label."""
+        return "nothing was done in them" if self.options.missing == "nothing" else "another sequence begins after each"
+
     def part(
         self, rows: Integers, labels: NDArray[Any], start: Floats, stop: Floats, stretch: Integers | None = None
     ) -> Part:
@@ -333,7 +338,7 @@ class Table:
 
         Args:
             rows: int `[events]`.
-            labels: str `[events]`, "" where none is known: what follows is another fragment.
+            labels: str `[events]`, "" where none is known: what follows is another fragment, unless nothing was done.
             start, stop: float64 `[events]`, NaN where not known.
             stretch: int `[events]`, the stretch of its recording, between two gaps, that each is in; None: one.
         """
@@ -357,8 +362,10 @@ class Table:
         if stretch is not None:
             begin |= np.diff(stretch[order], prepend=-1) != 0
         missing = events["behaviour"].eq("").to_numpy()
-        begin[1:] |= missing[:-1]
-        fragment = np.cumsum(begin | missing) - 1
+        if self.options.missing != "nothing":
+            begin[1:] |= missing[:-1]
+            begin |= missing
+        fragment = np.cumsum(begin) - 1
         events, fragment, rows = events[~missing].reset_index(drop=True), fragment[~missing], rows[~missing]
         fragment = np.unique(fragment, return_inverse=True)[1].astype(np.int64)
         part = Part(self.sheet, self.roles, events, fragment, rows, self.unit, self.notes, self.first_notes)

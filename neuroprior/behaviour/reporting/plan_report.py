@@ -55,16 +55,13 @@ from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, FOLDS, in_parts
 from neuroprior.plans.plans import AnyPlans
 from neuroprior.priors import Prior, load
 from neuroprior.priors.matching import learned_names, renumbered
-from neuroprior.priors.scoring import are_among, learned_from, plan_digests
+from neuroprior.priors.scoring import LONG_ENOUGH, are_among, learned_from, plan_digests
 
 MOST_ACTIONS = 10_000
 """Kinds of actions beyond which they are thought to be names that look like numbers."""
 
 SECONDS_A_STATUS = 60
 """How often the page says anew how long networks take."""
-
-LONG_ENOUGH = 20
-"""Actions from which on equal plans are thought to be the same one."""
 
 
 @claim_out

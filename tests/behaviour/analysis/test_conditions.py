@@ -11,6 +11,7 @@ import torch
 from scipy import stats
 
 from neuroprior import Plans
+from neuroprior._statistics import p_words
 from neuroprior.behaviour import PermutationDesign, compare_conditions, holm
 from neuroprior.behaviour.analysis.condition_chains import SMOOTHING
 from neuroprior.behaviour.recorded_plans import RecordedPlans
@@ -293,13 +294,13 @@ def test_all_labellings_are_compared_where_they_are_no_more(permutations, labell
     found = compare_conditions(study(0, between(8)), permutations, seeded(0))
     assert (found.labellings, found.exact, found.smallest_p) == (labellings, labellings == 70, pytest.approx(smallest))
     assert found.conclusive
-    assert f"With 4 against 4 subjects the smallest possible p is {smallest:.2g}" in found.verdict
+    assert f"With 4 against 4 subjects the smallest possible is {p_words(smallest)}" in found.verdict
 
 
 def test_with_too_few_there_is_no_verdict():
     found = compare_conditions(study(0, between(4), slower={0: 100.0}, habit=0.1))
     assert found.smallest_p == pytest.approx(2 / 6)
-    assert found.verdict == "With 2 against 2 subjects the smallest possible p is 0.33: no test can find a difference."
+    assert found.verdict == "With 2 against 2 subjects the smallest possible is p = .33: no test can find a difference."
     assert not any(found.significant(family).any() for family in found.families)
     # Three animals under three conditions have enough permutations, but are too few.
     found = compare_conditions(study(0, within(3, 3, 3)))
