@@ -117,5 +117,5 @@ def _on_past(plans: RecordedPlans, before: RecordedPlans) -> list[str]:
     if plans.group is not None and before.group is not None:
         here, there = (set(group_names(each, group)) for each, group in ((plans, plans.group), (before, before.group)))
         if alone := sorted(here - there):
-            notes.append(f"{len(alone)} of {len(here)} subjects are not in it, and scored alone: {listed(alone[:9])}")
+            notes.append(f"{len(alone)} of {len(here)} subjects are not in it, and scored alone: {listed(alone)}")
     return notes
