@@ -1,10 +1,8 @@
 """`neuroprior score`: how probable plans are under a saved prior."""
 
 from dataclasses import replace
-from math import log
 from pathlib import Path
 
-import torch
 from rich.console import Console
 
 from neuroprior._folders import claim, claim_out
@@ -16,7 +14,7 @@ from neuroprior.behaviour.reporting.options import ReadOptions, is_recording, na
 from neuroprior.plans.columns import listed
 from neuroprior.priors import load
 from neuroprior.priors.matching import learned_names, match_plans, numbered_note, taken_note, with_contexts_of
-from neuroprior.priors.scoring import LONG_ENOUGH, are_among, learned_from, log_probs_after, plan_digests, scores_by
+from neuroprior.priors.scoring import LONG_ENOUGH, are_among, bits_after, learned_from, plan_digests, scores_by
 
 UNITS = ("plan", "group", "condition")
 """What has a table of its own, if the plans have it."""
@@ -68,8 +66,7 @@ def score(
     units = [by for by in UNITS if by == "plan" or getattr(plans, by) is not None]
     with claim(place) as claimed:
         claimed.check(f"{by}s.csv" for by in units)
-    with torch.no_grad():
-        bits = -log_probs_after(prior, matched, earlier).double().cpu() / log(2)
+    bits = bits_after(prior, matched, earlier)
     whole = score_bits(folder, "", bits, matched).bits_per_action()
     learned = learned_from(Path(folder), plans)
     frames = {f"{by}s": scores_by(bits, plans, by, learned) for by in units}

@@ -37,7 +37,7 @@ def score(prior: Prior | str | os.PathLike[str], plans: Plans, by: str = "plan",
             end symbol of the prior, see `match_plans`).
         by: what a row is: "plan", "action", "group", or what else a subclass of `Plans` has for each plan, such as
             "condition".
-        past: earlier plans of the same groups, see `log_probs_after`; None: each plan stands alone.
+        past: earlier plans of the same groups, see `bits_after`; None: each plan stands alone.
 
     Returns:
         A pandas frame: `by`; `plans` and `actions`, how many (of a plan `actions` alone, its number, and its `group`
@@ -46,7 +46,7 @@ def score(prior: Prior | str | os.PathLike[str], plans: Plans, by: str = "plan",
         plans the prior has learned from, at least in part (of a group: how many): their bits are too low.
 
     Raises:
-        ValueError: the prior does not know the actions or contexts, plans have no groups, or see `log_probs_after`.
+        ValueError: the prior does not know the actions or contexts, plans have no groups, or see `bits_after`.
 
     Example:
         >>> plans = Plans(torch.tensor([[0, 1, 2], [2, 1, 0]]), 3, group=torch.tensor([0, 1]))
@@ -61,18 +61,17 @@ def score(prior: Prior | str | os.PathLike[str], plans: Plans, by: str = "plan",
             "`prior` must be a fitted prior of numbered actions (neuroprior.load gives that of a folder), got"
             f" {type(prior).__name__}"
         )
-    with torch.no_grad():
-        if past is not None and not isinstance(past, Plans):
-            raise ValueError(f"`past` must be Plans, got {type(past).__name__}.")
-        earlier = None if past is None else match_plans(past, prior)
-        log_probs = log_probs_after(prior, match_plans(plans, prior), earlier)
+    if past is not None and not isinstance(past, Plans):
+        raise ValueError(f"`past` must be Plans, got {type(past).__name__}.")
+    bits = bits_after(prior, match_plans(plans, prior), None if past is None else match_plans(past, prior))
     plans = plans if plans.end is None else plans.without_end()
     learned = None if folder is None else learned_from(Path(folder), plans)
-    return scores_by(-log_probs.cpu().double() / log(2), plans, by, learned)
+    return scores_by(bits, plans, by, learned)
 
 
-def log_probs_after(prior: Prior, plans: Plans, past: Plans | None) -> Tensor:
-    """The log-probability of each action where the counts of a group, an individual, begin with its earlier plans.
+@torch.no_grad()
+def bits_after(prior: Prior, plans: Plans, past: Plans | None = None) -> Tensor:
+    """The bits of each action where the counts of a group, an individual, begin with its earlier plans.
 
     Args:
         prior: fitted; with `past` it learns along a sequence, see `neuroprior.priors.adapt`.
@@ -80,25 +79,27 @@ def log_probs_after(prior: Prior, plans: Plans, past: Plans | None) -> Tensor:
         past: earlier plans; groups are the same by name, or by number where there are no names. None: there are none.
 
     Returns:
-        `[N, L]`, nats, as `Prior.action_log_probs`.
+        `[N, L]`, float64, on the CPU; 0 beyond a plan's end.
 
     Raises:
         ValueError: plans without groups, no group in both, or a prior that does not learn along a sequence.
     """
-    log_probs = prior.action_log_probs(plans_for(prior, plans))
     if past is None:
-        return log_probs
+        return -prior.action_log_probs(plans_for(prior, plans)).double().cpu() / log(2)
     past = past[past.mask().any(1)]
     if plans.group is None or past.group is None:
         raise ValueError("`past` must have groups, as `plans` must: the individuals whose counts go on.")
     groups, earlier = (np.array(_names(each, "group"), dtype=object) for each in (plans, past))
-    if not (both := [name for name in dict.fromkeys(groups) if name in set(earlier)]):
+    alone = torch.tensor([name not in set(earlier) for name in groups])
+    if alone.all():
         of_plans, of_past = (", ".join(map(str, dict.fromkeys(names))) for names in (groups[:9], earlier[:9]))
         raise ValueError(f"`past` must hold plans of groups of `plans`, such as {of_plans}; got {of_past or 'none'}.")
-    for name in both:
-        own, before = (torch.from_numpy(names == name) for names in (groups, earlier))
-        log_probs[own] = adapt(prior, past[before]).action_log_probs(plans_for(prior, plans[own]))
-    return log_probs
+    bits = torch.zeros(plans.actions.shape, dtype=torch.double)
+    bits[alone] = bits_after(prior, plans[alone])
+    for name in dict.fromkeys(groups[~alone.numpy()]):
+        rows, before = (torch.from_numpy(names == name) for names in (groups, earlier))
+        bits[rows] = bits_after(adapt(prior, past[before]), plans[rows])
+    return bits
 
 
 def scores_by(bits: Tensor, plans: Plans, by: str, learned: list[bool] | None = None) -> Any:

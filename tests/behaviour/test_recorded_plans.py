@@ -30,20 +30,20 @@ PLANS = RecordedPlans(
 )
 
 
-def told(values):
+def to_lists(values):
     """Numbers in lists, None for those that are not known."""
     return [[None if math.isnan(one) else one for one in row] for row in values.tolist()]
 
 
 def test_times_are_stored_where_there_are_actions():
     assert (PLANS.began.dtype, PLANS.durations.dtype) == (torch.float64, torch.float32)
-    assert told(PLANS.began) == [[0, 2.5, 4], [9.5, None, 0], [1e9 + 0.125, 0, 0]]
-    assert told(PLANS.durations) == [[2.5, 1.5, None], [0, 3, 0], [7, 0, 0]]
+    assert to_lists(PLANS.began) == [[0, 2.5, 4], [9.5, None, 0], [1e9 + 0.125, 0, 0]]
+    assert to_lists(PLANS.durations) == [[2.5, 1.5, None], [0, 3, 0], [7, 0, 0]]
     shown = RecordedPlans(PLANS.actions, 3, PLANS.lengths, began=torch.ones(3, 3), durations=torch.ones(3, 3))
     assert shown.began.tolist() == shown.durations.tolist() == [[1, 1, 1], [1, 1, 0], [1, 0, 0]]
     ones = torch.ones(1, 3)
     ended = RecordedPlans(torch.tensor([[0, 1, 2]]), 3, end=2, began=ones, durations=ones)
-    assert (told(ended.began), told(ended.durations)) == ([[1, 1, None]], [[1, 1, 0]])
+    assert (to_lists(ended.began), to_lists(ended.durations)) == ([[1, 1, None]], [[1, 1, 0]])
 
 
 @pytest.mark.parametrize("index", [slice(1, 3), torch.tensor([2, 0]), torch.tensor([True, False, True])])
@@ -52,29 +52,29 @@ def test_indexing_takes_everything_along(index):
     some = PLANS[index]
     assert isinstance(some, RecordedPlans)
     assert some.recording == tuple(FIELDS["recording"][row] for row in rows)
-    assert told(some.began) == [told(PLANS.began)[row] for row in rows]
-    assert told(some.durations) == [told(PLANS.durations)[row] for row in rows]
+    assert to_lists(some.began) == [to_lists(PLANS.began)[row] for row in rows]
+    assert to_lists(some.durations) == [to_lists(PLANS.durations)[row] for row in rows]
     assert some.condition.tolist() == [FIELDS["condition"].tolist()[row] for row in rows]
     assert (some.condition_names, some.notes) == (FIELDS["condition_names"], FIELDS["notes"])
 
 
 def test_steps_and_parts_have_the_times_of_their_actions():
     cut = PLANS.steps(1, 3)
-    assert told(cut.began) == [[2.5, 4], [None, 0], [0, 0]]
-    assert told(cut.durations) == [[1.5, None], [3, 0], [0, 0]]
+    assert to_lists(cut.began) == [[2.5, 4], [None, 0], [0, 0]]
+    assert to_lists(cut.durations) == [[1.5, None], [3, 0], [0, 0]]
     parts = in_parts(PLANS[:1], 2)
-    assert told(parts.began) == [[0, 2.5], [4, 0]]
+    assert to_lists(parts.began) == [[0, 2.5], [4, 0]]
     assert parts.recording == ("s1", "s1")
     assert parts.condition.tolist() == [1, 1]
 
 
 def test_an_end_symbol_takes_no_time_and_comes_off_again():
     closed = PLANS.with_end()
-    assert told(closed.durations) == [[2.5, 1.5, None, 0], [0, 3, 0, 0], [7, 0, 0, 0]]
-    assert told(closed.began) == [[0, 2.5, 4, None], [9.5, None, None, 0], [1e9 + 0.125, None, 0, 0]]
+    assert to_lists(closed.durations) == [[2.5, 1.5, None, 0], [0, 3, 0, 0], [7, 0, 0, 0]]
+    assert to_lists(closed.began) == [[0, 2.5, 4, None], [9.5, None, None, 0], [1e9 + 0.125, None, 0, 0]]
     opened = closed.without_end()
-    assert told(opened.durations) == told(PLANS.durations)
-    assert told(opened.began) == told(PLANS.began)
+    assert to_lists(opened.durations) == to_lists(PLANS.durations)
+    assert to_lists(opened.began) == to_lists(PLANS.began)
     assert closed.recording == opened.recording == PLANS.recording
 
 
@@ -97,7 +97,7 @@ def test_npz_files_hold_everything_and_others_refuse_it(tmp_path):
         assert getattr(back, name).equal(getattr(PLANS, name)), name
     for name in ("began", "durations"):
         assert getattr(back, name).dtype == getattr(PLANS, name).dtype
-        assert told(getattr(back, name)) == told(getattr(PLANS, name))
+        assert to_lists(getattr(back, name)) == to_lists(getattr(PLANS, name))
     assert (back.recording, back.condition_names, back.notes) == (
         PLANS.recording,
         PLANS.condition_names,
@@ -156,5 +156,5 @@ def test_parts_of_a_split_have_what_belongs_to_them():
     for part in plans.split(0.4, torch.Generator().manual_seed(0)):
         assert [("a", "b", "a")[int(first) // 2] for first in part.actions[:, 0]] == list(part.recording)
     first, last = PLANS[:1].split(0.34)
-    assert (told(first.durations), told(last.durations)) == ([[2.5, 1.5]], [[None]])
-    assert (told(first.began), told(last.began)) == ([[0, 2.5]], [[4]])
+    assert (to_lists(first.durations), to_lists(last.durations)) == ([[2.5, 1.5]], [[None]])
+    assert (to_lists(first.began), to_lists(last.began)) == ([[0, 2.5]], [[4]])

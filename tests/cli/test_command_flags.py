@@ -185,34 +185,35 @@ def fit_outcome(place: Path) -> dict[str, Any]:
     (folder,) = {path.parent for path in place.rglob("config.json")}
     saved, results = (json.loads((folder / f"{name}.json").read_text()) for name in ("config", "metrics"))
     plans = ReadOptions().read(folder / "plans.npz")
-    found = {f"config.{name}": value for name, value in saved["config"].items()}
-    found |= {f"sizes.{part}": size for part, size in results["plans"].items()}
+    values = {f"config.{name}": value for name, value in saved["config"].items()}
+    values |= {f"sizes.{part}": size for part, size in results["plans"].items()}
     for file in {"orders.csv", "modes.csv"} & {path.name for path in folder.iterdir()}:
-        found[file] = pd.read_csv(folder / file).iloc[:, 0].tolist()
-    found |= {name: results[name] for name in ("folds", "curve")} | {name: saved[name] for name in ("prior", "weights")}
-    found |= {"plans": plans.actions.tolist(), "number": len(plans), "longest": plans.max_length}
-    found["context"] = None if plans.context is None else len(plans.context.unique())
-    found["not held out"] = json.loads((folder / "learned.json").read_text())["plans"]
+        values[file] = pd.read_csv(folder / file).iloc[:, 0].tolist()
+    values |= {name: results[name] for name in ("folds", "curve")}
+    values |= {name: saved[name] for name in ("prior", "weights")}
+    values |= {"plans": plans.actions.tolist(), "number": len(plans), "longest": plans.max_length}
+    values["context"] = None if plans.context is None else len(plans.context.unique())
+    values["not held out"] = json.loads((folder / "learned.json").read_text())["plans"]
     scores = [(row["model"], row["context"], row["how"], row["bits_per_action"]) for row in results["rows"]]
-    found |= {"baselines": scores[:-1], "trained": scores[-1], "steps": [row["step"] for row in results["curve"]]}
-    return found | {"end": saved["learned"]["end"]}
+    values |= {"baselines": scores[:-1], "trained": scores[-1], "steps": [row["step"] for row in results["curve"]]}
+    return values | {"end": saved["learned"]["end"]}
 
 
 def report_outcome(place: Path) -> dict[str, Any]:
     """What a report found."""
     (file,) = place.rglob("results.json")
     results = json.loads(file.read_text())
-    found = {f"settings.{name}": value for name, value in results.pop("settings").items()}
-    found |= {"modes": [row["modes"] for row in results.pop("modes", [])]}
-    found |= {f"{name}s": [row[name] for row in results["scores"]] for name in ("model", "input")}
-    return found | results | {"inputs": sorted({*found["inputs"]})}
+    values = {f"settings.{name}": value for name, value in results.pop("settings").items()}
+    values |= {"modes": [row["modes"] for row in results.pop("modes", [])]}
+    values |= {f"{name}s": [row[name] for row in results["scores"]] for name in ("model", "input")}
+    return values | results | {"inputs": sorted({*values["inputs"]})}
 
 
 def score_outcome(place: Path) -> dict[str, Any]:
     """Log-likelihoods of plans, and of each animal by its name."""
     plans, groups = (pd.read_csv(next(place.rglob(f"{name}.csv"))) for name in ("plans", "groups"))
-    found = {"actions": plans["actions"].tolist(), "plans": plans["log_likelihood"].tolist()}
-    return found | dict(zip(groups["group"], groups["log_likelihood"], strict=True))
+    values = {"actions": plans["actions"].tolist(), "plans": plans["log_likelihood"].tolist()}
+    return values | dict(zip(groups["group"], groups["log_likelihood"], strict=True))
 
 
 def read_outcome(words: list[str]) -> dict[str, Any]:
@@ -224,11 +225,11 @@ def read_outcome(words: list[str]) -> dict[str, Any]:
     except ValueError as error:
         return {"error": str(error)}
     actions = [row[mask].tolist() for row, mask in zip(plans.actions, plans.mask(), strict=True)]
-    found = {"plans": [[action_names(plans)[action] for action in row] for row in actions], "notes": plans.notes}
+    values = {"plans": [[action_names(plans)[action] for action in row] for row in actions], "notes": plans.notes}
     for name in ("group", "condition", "stratum"):
         numbers, names = getattr(plans, name), getattr(plans, f"{name}_names")
-        found |= {name: None if numbers is None else [names[number] for number in numbers], f"{name}_names": names}
-    return found | {"num_actions": plans.num_actions, "action_names": plans.action_names}
+        values |= {name: None if numbers is None else [names[number] for number in numbers], f"{name}_names": names}
+    return values | {"num_actions": plans.num_actions, "action_names": plans.action_names}
 
 
 @pytest.fixture(scope="module")
@@ -246,17 +247,17 @@ def outcome(tmp_path_factory, undrawn):
     def run(words: str) -> dict[str, Any]:
         if words in known:
             return known[words]
-        place, found = top / f"run{sum(1 for _ in top.iterdir())}", {}
+        place, values = top / f"run{sum(1 for _ in top.iterdir())}", {}
         place.mkdir()
         train, each = command.train, JobRun.each
 
         def spied_train(prior, plans, how, *rest):
-            found.update({f"training.{name}": value for name, value in vars(how).items() if name != "validation"})
-            found["training.seed"] = rest[0]
+            values.update({f"training.{name}": value for name, value in vars(how).items() if name != "validation"})
+            values["training.seed"] = rest[0]
             return train(prior, plans, how, *rest)
 
         def spied_each(self, jobs, **how):
-            found.update({f"{how['title']}.{name}": how[name] for name in ("processes", "dask")})
+            values.update({f"{how['title']}.{name}": how[name] for name in ("processes", "dask")})
             return each(self, jobs, **how | {"processes": 1, "dask": None})
 
         with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as said:
@@ -270,17 +271,17 @@ def outcome(tmp_path_factory, undrawn):
             with redirect_stderr(io.StringIO()) as errors:
                 assert main(words.split()) == 0, errors.getvalue()
         files = [path for path in place.rglob("*") if path.is_file() and not {"folds", "tensorboard"} & {*path.parts}]
-        found["files"] = sorted(path.name for path in files)
-        found["folders"] = sorted({str(path.parent.relative_to(place)) for path in files})
-        found["kinds"] = sorted({path.suffix for path in files})
-        found["says steps"] = "training: step" in errors.getvalue()
+        values["files"] = sorted(path.name for path in files)
+        values["folders"] = sorted({str(path.parent.relative_to(place)) for path in files})
+        values["kinds"] = sorted({path.suffix for path in files})
+        values["says steps"] = "training: step" in errors.getvalue()
         if name == "sample":
             lines = (files[0].read_text() if files else said.getvalue()).splitlines()[1:]
             plans = [json.loads(line)["actions"] for line in lines]
-            found |= {"plans": plans, "number": len(plans), "longest": max(map(len, plans))}
+            values |= {"plans": plans, "number": len(plans), "longest": max(map(len, plans))}
         else:
-            found |= {"fit": fit_outcome, "report": report_outcome, "score": score_outcome}[name](place)
-        return known.setdefault(words, found)
+            values |= {"fit": fit_outcome, "report": report_outcome, "score": score_outcome}[name](place)
+        return known.setdefault(words, values)
 
     for name, how in ("chain", COLUMNS), ("rooms", ROOM):
         assert main(f"fit {top}/data.csv {how} --prior markov --folds 1 --out {top}/{name}".split()) == 0
@@ -308,10 +309,10 @@ def test_no_option_is_left_out(name, monkeypatch):
 
 @pytest.mark.parametrize(("beside", "option", "changes"), CASES, ids=[f"{one[0].split()[0]} {one[1]}" for one in CASES])
 def test_an_option_changes_what_it_says_and_nothing_else(beside, option, changes, outcome):
-    without, found = outcome(beside), outcome(f"{beside} --{option}")
-    assert {name for name in {*without, *found} if without.get(name) != found.get(name)} == {*changes}
+    without, values = outcome(beside), outcome(f"{beside} --{option}")
+    assert {name for name in {*without, *values} if without.get(name) != values.get(name)} == {*changes}
     predicted = {name: value for name, value in changes.items() if value is not ...}
-    assert {name: found.get(name) for name in predicted} == predicted
+    assert {name: values.get(name) for name in predicted} == predicted
 
 
 READING = "--max_gap 3.5 --compare sex --reference m --strata drug --num_actions 3 --action_names a b c --unknown gap"
@@ -319,10 +320,10 @@ READING = "--max_gap 3.5 --compare sex --reference m --strata drug --num_actions
 
 @pytest.mark.parametrize("words", ["fit ../study.csv", "report ../study.csv", "score ../chain ../study.csv"])
 def test_how_files_are_read_is_passed_on(words, outcome, monkeypatch):
-    given = []
+    passed = []
 
     def keep(options, recordings):
-        given.append(options)
+        passed.append(options)
         raise ValueError("enough")
 
     monkeypatch.setattr(ReadOptions, "plans", keep)
@@ -330,4 +331,4 @@ def test_how_files_are_read_is_passed_on(words, outcome, monkeypatch):
         outcome(f"{words} {COLUMNS} {READING}")
     due = {"max_gap": 3.5, "compare": "sex", "reference": "m", "strata": ["drug"], "num_actions": 3}
     due |= {"action_names": ["a", "b", "c"], "unknown": "gap"}
-    assert vars(given[0]) == vars(ReadOptions(columns=given[0].columns, **due))
+    assert vars(passed[0]) == vars(ReadOptions(columns=passed[0].columns, **due))

@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from math import inf, log, log2
+from math import inf, log2
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from neuroprior.priors import ContextTreePrior, Prior, UniformPrior
 from neuroprior.priors.counts import Chains, TooLargeError
 from neuroprior.priors.ensembles.candidates import DEPTH, ORDERS
 from neuroprior.priors.learning import plans_for
+from neuroprior.priors.scoring import bits_after
 
 ACTIONS, CONTEXT, DURATIONS = "behaviours", "behaviours and context", "behaviours and durations"
 """The input of a model, in the words of reports; durations are those of past actions."""
@@ -134,8 +135,7 @@ def action_bits(prior: Prior, plans: Plans) -> Tensor:
     if not isinstance(prior, Prior):
         raise ValueError(f"`prior` must be a fitted prior, got {type(prior).__name__}.")
     check_are_plans(plans)
-    with torch.no_grad():
-        return -prior.action_log_probs(plans_for(prior, plans)).double().cpu() / log(2)
+    return bits_after(prior, plans)
 
 
 def never_occur(occur: Integers, num_actions: int, names: Sequence[str] | None = None) -> str:

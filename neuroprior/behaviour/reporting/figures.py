@@ -18,6 +18,7 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
+from neuroprior.behaviour.analysis.comparison import ACTIONS, CONTEXT, DURATIONS
 from neuroprior.behaviour.recorded_plans import RecordedPlans, action_names, group_names
 from neuroprior.behaviour.reporting.drawing import (
     DIGITS,
@@ -59,11 +60,7 @@ MOST_NAMES = 60  # actions up to which each has its name beside the matrix; of m
 
 OTHER = "#7d838c"
 
-INPUT_STYLES = {
-    "behaviours": ("o", True),
-    "behaviours and context": ("o", False),
-    "behaviours and durations": ("D", False),
-}
+INPUT_STYLES = {ACTIONS: ("o", True), CONTEXT: ("o", False), DURATIONS: ("D", False)}
 """How a dot of a model with an input is drawn: its marker, and whether it is hollow."""
 
 DEEPEST = 0.8
@@ -92,8 +89,8 @@ def score_figure(scores: pd.DataFrame) -> Figure:
     arrow at the edge, so that the others can be compared; all values stand at the right.
 
     Args:
-        scores: the table `scores` of a report: `model`, `input` ("behaviours", "behaviours and context" or
-            "behaviours and durations"), `bits_per_behaviour`, `low`, `high`; a model may have a row for each input.
+        scores: the table `scores` of a report: `model`, `input` (`ACTIONS`, `CONTEXT` or `DURATIONS`),
+            `bits_per_behaviour`, `low`, `high`; a model may have a row for each input.
     """
     expect_some("scores", scores)
     best = scores.assign(bits=floats(scores["bits_per_behaviour"])).groupby("model", sort=False)["bits"].min()
