@@ -24,7 +24,7 @@ WIDTH = 160
 def render_summary(recordings: Any) -> str:
     """Return the text of what `describe` yields; see `Recordings.summary`."""
     text = StringIO()
-    console = Console(file=text, width=WIDTH, highlight=False, markup=False)
+    console = Console(file=text, width=WIDTH, highlight=False, markup=False, emoji=False)
     for line in describe(recordings):
         console.print(line, soft_wrap=isinstance(line, str))
     return text.getvalue()

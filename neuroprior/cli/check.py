@@ -20,7 +20,7 @@ def check(files: list[str], reading: Options = Options()) -> None:  # noqa: B008
     Raises:
         ValueError: the files cannot be read; each problem is printed before.
     """
-    console = Console(soft_wrap=True, highlight=False, markup=False)
+    console = Console(soft_wrap=True, highlight=False, markup=False, emoji=False)
     try:
         recordings = read_recordings(files, reading)
     except ReadingError as error:

@@ -250,7 +250,7 @@ def _choose_modes(prior: Prior, modes: list[int], parts: Parts) -> tuple[Prior, 
         generator=torch.Generator().manual_seed(parts.seed),
         **arguments,
     )
-    Console(markup=False).print(printed("Hidden modes", choice_table(choice)))
+    Console(markup=False, emoji=False).print(printed("Hidden modes", choice_table(choice)))
     return SwitchingPrior(**prior.config | {"num_modes": choice.chosen}), choice.frame()
 
 
@@ -271,7 +271,7 @@ def _choose_order(prior: Prior, orders: list[int], parts: Parts) -> tuple[Prior,
     columns: dict[str, Column] = {"chain": "chain", "back-off, smoothing": "how", "bits per action": "bits:.4f"}
     columns[""] = lambda row: "chosen" if row.chosen else ""
     shown = table(frame, columns, "On plans that the chains did not learn from.", align="llrl")
-    Console(markup=False).print(printed("Order of the chain", shown))
+    Console(markup=False, emoji=False).print(printed("Order of the chain", shown))
     chosen = {name: best.prior.config[name] for name in ("order", "smoothing", "backoff")}
     return MarkovPrior(**prior.config | chosen), frame
 

@@ -41,7 +41,7 @@ def report(
         fresh: the prior before training, for a cross-validation.
         settings: of its `fit` there.
     """
-    console = Console(markup=False)
+    console = Console(markup=False, emoji=False)
     prior, name = prior.cpu().eval(), name_of(prior)
     model, parts = model_bytes(prior), (data.learned_from, data.chosen_on)
     many = data.folds > 1

@@ -90,7 +90,7 @@ def score(
         notes.append(f"{numbered_note('actions', plans.action_names)}; --action_names orders them")
     if plans.action_names is None and known is not None:
         notes.append(taken_note("actions", known))
-    console = Console(markup=False)
+    console = Console(markup=False, emoji=False)
     for note in notes:
         console.print(f"note: {note}", highlight=False, soft_wrap=True)
     after = "" if past is None else f" after {name_files(past)}"

@@ -57,7 +57,7 @@ def test_plans_are_fragments_with_recording_group_condition_and_times():
 
 
 def test_a_summary_lists_all_behaviours_and_the_first_events():
-    many = pd.DataFrame({"animal": "m1", "behaviour": [f"b{n:02d}" for n in range(45)], "start": range(45)})
+    many = pd.DataFrame({"animal": "m1", "behaviour": [f"b{n % 45:02d}" for n in range(90)], "start": range(90)})
     said = read(many).summary()
     assert all(f"b{n:02d} " in said for n in range(45))
     assert said.count("b00 ") > said.count("b44 ")

@@ -19,9 +19,9 @@ from neuroprior.behaviour.reading.names import (
     Program,
     plain,
 )
-from neuroprior.behaviour.reading.problems import ReadingError
+from neuroprior.behaviour.reading.problems import Problems, ReadingError
 from neuroprior.behaviour.reading.sheets import Sheet
-from neuroprior.behaviour.reading.times import MISSING_TIMES, count_times
+from neuroprior.behaviour.reading.times import MISSING_TIMES, count_times, read_times
 
 NOT_USED = "none"
 """Stands for a column's name: no column has this use."""
@@ -40,6 +40,10 @@ MAX_OBSERVERS = 10
 MIN_WIDE = 3
 """Columns at least, where each row is a sequence."""
 
+MIN_FRAME_ROWS, MIN_EXCESS = 20, 0.2
+"""Rows at least, and how much more often a cell is as the one above it than as the one before it, at least, where rows
+may be frames and columns subjects."""
+
 
 @dataclass(frozen=True)
 class Columns:
@@ -48,7 +52,8 @@ class Columns:
     Attributes:
         behaviour: a name; several, whose labels are joined, or which hold 0 and 1, one a behaviour; or a range such as
             "Jul.93:Jun.99" where a row is a sequence.
-        subject: the animal or person; without it each recording is one.
+        subject: the animal or person; without it each recording is one; or a range such as "m1:m9" of columns that each
+            hold the labels of one, at the frame of the row.
         recording: the session, observation or video; without it each file is one.
         start, stop, duration: when a behaviour began and ended, or how long it took: numbers, h:m:s or dates. Where
             starts and stops are rows of their own, `start` is the time of each row.
@@ -111,8 +116,8 @@ class Roles:
     Attributes:
         at: names of the sheet's columns by use; uses without a column are left out.
         inferred: uses that no user named.
-        layout: "events", "rows of starts and stops", "rows of frames", "columns of behaviours" (0 and 1) or
-            "rows of sequences".
+        layout: "events", "rows of starts and stops", "rows of frames", "columns of behaviours" (0 and 1), "columns of
+            subjects" (frames) or "rows of sequences".
         program: the program that wrote the file; None where it is not known.
         notes: a line each.
     """
@@ -148,7 +153,9 @@ def find_roles(sheet: Sheet, columns: Columns, words: Mapping[str, str]) -> Role
     _drop_empty(sheet, roles)
     _drop_index(sheet, roles)
     if not sheet.header and not named:
-        return _without_header(sheet, roles)
+        _find_roles_without_header(sheet, roles)
+        _check_direction(sheet, roles)
+        return roles
     if program:
         for use, wanted in program.columns.items():
             column = next((plains[one] for one in wanted if one in plains), None)
@@ -164,8 +171,14 @@ def find_roles(sheet: Sheet, columns: Columns, words: Mapping[str, str]) -> Role
     _add_factors_above(sheet, roles, closed)
     if {"plan", "action"} <= set(_by_plain_name(sheet.frame)) and not {"subject", "factors"} & closed:
         _take_group_as_subject(sheet, roles)
-    _choose_behaviour(sheet, roles, "behaviour" in ranges, closed)
+    if "subject" in ranges:
+        roles.at["behaviour"], roles.layout = roles.at.pop("subject"), "columns of subjects"
+    else:
+        _choose_behaviour(sheet, roles, "behaviour" in ranges, closed)
     _choose_layout(sheet, roles, words)
+    if "recording" in roles.inferred and "recording" not in (program.columns if program else ()):
+        _choose_recordings(sheet, roles)
+    _check_direction(sheet, roles)
     if roles.layout == "rows of sequences":
         for use in ("start", "stop", "duration"):
             if use in roles.inferred:
@@ -266,8 +279,8 @@ def _drop_index(sheet: Sheet, roles: Roles) -> None:
             sheet.frame = sheet.frame.drop(columns=name)
 
 
-def _without_header(sheet: Sheet, roles: Roles) -> Roles:
-    """Return the roles of Audacity's labels (start, stop, label), of a column of frames, or of a sequence a row."""
+def _find_roles_without_header(sheet: Sheet, roles: Roles) -> None:
+    """Give roles to the columns of Audacity's labels (start, stop, label), of frames, or of a sequence a row."""
     frame = sheet.frame
     numeric = [bool(pd.to_numeric(frame[name].str.replace(",", "."), errors="coerce").notna().all()) for name in frame]
     names = list(frame.columns)
@@ -279,7 +292,7 @@ def _without_header(sheet: Sheet, roles: Roles) -> Roles:
         if len(names) == 3 and (decimals or not numeric[2]) and bool((stop >= start).all()):
             roles.at = {"start": [names[0]], "stop": [names[1]], "behaviour": [names[2]]}
             roles.notes.append(f"{sheet.name} is read as labels of Audacity: start, stop, label")
-            return roles
+            return
     clocks = [name for name in names if frame[name].str.fullmatch(r"-?(\d+:)?\d+:\d+([.,]\d+)?").all()]
     if clocks:
         raise ReadingError(
@@ -288,7 +301,6 @@ def _without_header(sheet: Sheet, roles: Roles) -> Roles:
         )
     roles.infer("behaviour", names)
     roles.layout = "rows of sequences" if len(names) > 1 else "events"
-    return roles
 
 
 def _find_use(sheet: Sheet, roles: Roles, use: str, words: Mapping[str, str]) -> None:
@@ -320,26 +332,37 @@ def _find_use(sheet: Sheet, roles: Roles, use: str, words: Mapping[str, str]) ->
             kept = [name for name in kept if sheet.frame[name].nunique() <= MAX_OBSERVERS]
         elif candidates and not kept:
             roles.notes.append(f"the column {candidates[0]!r} is empty, and not used as {use}")
-        if use == "recording":
-            kept = _finest(sheet, kept, roles)
+        elif use == "subject" and not kept:
+            ids = [name for name in sheet.frame if plain(name).endswith(" id") and name not in roles.used()]
+            kept = [name for name in ids if sheet.frame[name].duplicated().any()] if len(ids) == 1 else []
     if kept:
         roles.infer(use, kept if use in ("factors", "context", "recording") else kept[:1])
 
 
-def _finest(sheet: Sheet, names: list[str], roles: Roles) -> list[str]:
-    """Return the columns that tell recordings apart: the first, and those that divide its recordings.
+def _choose_recordings(sheet: Sheet, roles: Roles) -> None:
+    """Keep the columns that tell recordings apart: the first, and those that divide its recordings.
 
-    Notes and leaves out columns that differ in each row, such as trials of one choice.
+    Notes and leaves out columns that differ in each row of a subject, such as trials of one choice.
     """
     chosen: list[str] = []
-    for name in names:
+    subjects = roles.at.get("subject", [])
+    for name in roles.at.pop("recording"):
+        per_subject = sheet.frame.groupby([*subjects, name], sort=False).ngroups
         groups = sheet.frame.groupby([*chosen, name], sort=False).ngroups
         before = sheet.frame.groupby(chosen, sort=False).ngroups if chosen else 0
-        if len(sheet.frame) > 2 and groups == len(sheet.frame):
-            roles.notes.append(f"the column {name!r} differs in each row, and is not used as recording")
+        repeated = not subjects or bool(sheet.frame.duplicated(subjects).any())
+        if (
+            roles.layout != "rows of sequences"
+            and len(sheet.frame) > 2
+            and per_subject == len(sheet.frame)
+            and repeated
+        ):
+            where = "of a subject, " if subjects else ""
+            roles.notes.append(f"the column {name!r} differs in each row {where}and is not used as recording")
         elif groups > before:
             chosen.append(name)
-    return chosen
+    if chosen:
+        roles.at["recording"] = chosen
 
 
 def _add_dates(sheet: Sheet, roles: Roles) -> None:
@@ -416,13 +439,13 @@ def _choose_behaviour(sheet: Sheet, roles: Roles, is_range: bool, closed: set[st
         raise ReadingError(f"{sheet.name}: {roles.program.name}, must have a column of labels ({wanted}), got none")
     elif usual:
         roles.at["behaviour"] = ([name for name in usual if plain(name) != "name"] or usual)[:1]
-    elif indicators := _indicator_columns(frame, free):
+    elif (indicators := _indicator_columns(frame, free)) and not (len(indicators) == 1 and _only_label(frame, free)):
         roles.at["behaviour"], roles.layout = indicators, "columns of behaviours"
         if any(name.startswith("Probability_") for name in free):
             roles.program = SIMBA
         elif indicators[0].lower() == "background":
             roles.program = DEEPETHOGRAM
-    elif run := _labelled_run(frame, free):
+    elif run := _labelled_run(frame, free, MIN_WIDE - ("start" in roles.at)):
         roles.at["behaviour"], roles.layout = run, "rows of sequences"
     elif (label := _only_label(frame, free)) and roles.at:
         roles.at["behaviour"] = [label]
@@ -522,7 +545,7 @@ def _share_labels(frame: Any, names: list[str]) -> bool:
     return float(np.mean(shares)) > 0.5
 
 
-def _labelled_run(frame: Any, free: list[str]) -> list[str]:
+def _labelled_run(frame: Any, free: list[str], min_columns: int) -> list[str]:
     """Return the longest run of neighbouring columns that share labels, which are texts and no numbers."""
     best: list[str] = []
     run: list[str] = []
@@ -536,7 +559,7 @@ def _labelled_run(frame: Any, free: list[str]) -> list[str]:
         else:
             run = [name]
         best = run if len(run) > len(best) else best
-    return best if len(best) >= MIN_WIDE else []
+    return best if len(best) >= min_columns else []
 
 
 def _only_label(frame: Any, free: list[str]) -> str | None:
@@ -578,7 +601,7 @@ def _check_is_no_summary(sheet: Sheet, roles: Roles) -> None:
 
 def _choose_layout(sheet: Sheet, roles: Roles, words: Mapping[str, str]) -> None:
     """Choose between events and rows of starts and stops, and leave out inferred uses that the layout has not."""
-    if roles.layout in ("rows of sequences", "columns of behaviours"):
+    if roles.layout in ("rows of sequences", "columns of behaviours", "columns of subjects"):
         if "event_type" in roles.inferred:
             roles.at.pop("event_type", None)
     elif "event_type" in roles.at:
@@ -591,6 +614,49 @@ def _choose_layout(sheet: Sheet, roles: Roles, words: Mapping[str, str]) -> None
             roles.layout = "rows of starts and stops"
             if "stop" in roles.inferred:
                 del roles.at["stop"]
+
+
+def _check_direction(sheet: Sheet, roles: Roles) -> None:
+    """Tell columns of subjects, in which a row is a frame, from rows of sequences, where no user says which.
+
+    Names such as "mouse 1" tell it. Else cells of frames are as those above them, those of sequences as those before.
+
+    Raises:
+        ReadingError: it may be either.
+    """
+    if roles.layout != "rows of sequences" or "behaviour" not in roles.inferred or "subject" in roles.at:
+        return
+    names = roles.at["behaviour"]
+    cells = sheet.frame[names].to_numpy(object)
+    excess = _share_equal(cells[1:], cells[:-1]) - _share_equal(cells[:, 1:], cells[:, :-1])
+    stems = {plain(match[1] or "") for name in names if (match := STEM_NUMBER.fullmatch(name))}
+    timed = _has_equal_steps(sheet, roles)
+    if (stems and stems <= set(NAMES["subject"])) or (timed and excess > MIN_EXCESS):
+        roles.layout = "columns of subjects"
+    elif (timed and excess > -MIN_EXCESS) or (len(cells) >= MIN_FRAME_ROWS and excess > MIN_EXCESS):
+        span = f"'{names[0]}:{names[-1]}'"
+        raise ReadingError(
+            f"{sheet.name}: a row must be a sequence or a frame, got a table that may be either; say whether each"
+            f" column is a subject (--columns.subject {span}) or each row a sequence (--columns.behaviour {span})"
+        )
+
+
+def _share_equal(cells: Any, others: Any) -> float:
+    """Return the share of cells that are equal to those at the same places in others, where neither is empty."""
+    filled = (cells != "") & (others != "")
+    return float((cells == others)[filled].mean()) if filled.any() else 0.0
+
+
+def _has_equal_steps(sheet: Sheet, roles: Roles) -> bool:
+    """Return whether there are times that grow by equal steps from row to row of each recording."""
+    if "start" not in roles.at:
+        return False
+    texts = sheet.frame[roles.at["start"][-1]].to_numpy(object)
+    times = read_times(texts, "start", sheet.place, Problems(), separator=sheet.separator).values
+    groups = roles.at.get("recording")
+    same = np.diff(sheet.frame.groupby(groups, sort=False).ngroup()) == 0 if groups else np.ones(len(times) - 1, bool)
+    steps = np.diff(times)[same]
+    return len(steps) > 1 and bool((np.isclose(steps, np.nanmedian(steps), rtol=0.02) & (steps > 0)).mean() > 0.9)
 
 
 def _note_unused(sheet: Sheet, roles: Roles, words: Mapping[str, str]) -> None:

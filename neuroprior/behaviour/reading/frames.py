@@ -8,12 +8,16 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from neuroprior.behaviour.reading.columns import INDICATORS
+from neuroprior.behaviour.reading.columns import INDICATORS, Roles
+from neuroprior.behaviour.reading.sheets import Sheet
 from neuroprior.behaviour.reading.table import MIN_REPEATS, Floats, Part, Table
 from neuroprior.behaviour.reading.times import MISSING_TIMES, smallest_unit
 
 TOGETHER = "+"
 """Between behaviours that are done at once."""
+
+NAME_OF_COLUMN, LABEL_IN_COLUMN = "name of the column", "label in the column"
+"""Columns of a table that had a column for each subject."""
 
 MIN_FRAME_REPEATS = 0.6
 """As `MIN_REPEATS`, where no name says that rows are frames: of two labels at random, half repeat."""
@@ -122,6 +126,24 @@ def rows_of_frames(table: Table) -> Part:
     else:
         table.split_sessions(start, labels)
     return read_labelled_frames(table, start, labels)
+
+
+def melt_subjects(sheet: Sheet, roles: Roles) -> tuple[Sheet, Roles]:
+    """Return columns of subjects as rows of frames: one row for each subject and frame, in this order."""
+    names, frame = roles.at["behaviour"], sheet.frame
+    long = frame.melt(
+        [name for name in frame if name not in names], names, var_name=NAME_OF_COLUMN, value_name=LABEL_IN_COLUMN
+    )
+    shown = f"{names[0]}, {names[1]}, ... ({len(names)} columns)" if len(names) > 2 else " and ".join(names)
+    note = f"{shown}: each is read as one subject with a label at each frame (--columns.behaviour"
+    note += f" '{names[0]}:{names[-1]}' if each row is a sequence)"
+    at = roles.at | {"behaviour": [LABEL_IN_COLUMN], "subject": [NAME_OF_COLUMN]}
+    inferred = roles.inferred | ({"subject"} if "behaviour" in roles.inferred else set())
+    lines = np.tile(sheet.lines, len(names))
+    return (
+        replace(sheet, frame=long, lines=lines),
+        replace(roles, at=at, inferred=inferred, layout="rows of frames", notes=[*roles.notes, note]),
+    )
 
 
 def read_labelled_frames(table: Table, start: Floats, labels: NDArray[Any]) -> Part:

@@ -15,14 +15,16 @@ NAMES: dict[str, tuple[str, ...]] = {
         "syllables reindexed",
         "event", "event name", "label", "labels", "state", "states", "annotation", "behavior code", "behaviour code",
         "behavior name", "element", "species", "call type", "classifier", "motif", "cluster", "prediction", "code",
-        "b soid labels", "sequence", "seq", "verhalten", "comportement", "comportamiento", "act", "status", "name",
+        "b soid labels", "sequence", "seq", "verhalten", "comportement", "comportamiento", "act", "status", "choice",
+        "response", "decision", "move", "aoi", "page", "name",
     ),
     "subject": (
         "subject", "subject id", "subjects", "animal", "animal id", "mouse", "mouse id", "rat", "rat id", "bird",
         "bird id", "individual", "individual id", "focal", "focal animal", "focal subject", "participant",
         "participant id", "person", "person id", "id", "pid", "ind", "individu", "tier", "case concept name", "case id",
         "case", "idhous", "subject name", "tier id",
-        "actor", "initiator", "proband", "sujet", "sujeto",
+        "subj", "subj id", "sub", "user", "user id", "player", "player id", "patient", "patient id", "child",
+        "child id", "actor", "initiator", "proband", "sujet", "sujeto",
     ),
     "recording": (
         "recording", "recording id", "session", "session id", "observation", "observation id", "video", "video name",
@@ -33,7 +35,8 @@ NAMES: dict[str, tuple[str, ...]] = {
     "start": (
         "start", "start time", "onset", "onset time", "begin", "begin time", "start timestamp", "from", "time relative",
         "time", "timestamp", "time timestamp", "times", "t", "trial time", "recording time", "second", "frame",
-        "frame index", "frame number", "frame id", "frames", "beginn", "anfang", "von", "zeit", "debut", "start frame",
+        "frame index", "frame number", "frame id", "frames", "bin", "time bin", "scan",
+        "beginn", "anfang", "von", "zeit", "debut", "start frame",
         "begin frame", "onset frame", "time relative hmsf", "time absolute hms", "date time", "datetime",
         "startzeit", "uhrzeit", "inicio", "event start",
         "start of event", "scan time", "epoch", "heure", "hora", "temps", "tiempo", "datum", "date",

@@ -12,6 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from neuroprior.behaviour.reading.columns import NOT_USED, Columns, find_roles
+from neuroprior.behaviour.reading.frames import melt_subjects
 from neuroprior.behaviour.reading.layouts import LAYOUTS
 from neuroprior.behaviour.reading.names import NAMES, plain
 from neuroprior.behaviour.reading.options import Options
@@ -19,6 +20,9 @@ from neuroprior.behaviour.reading.problems import Problems, ReadingError
 from neuroprior.behaviour.reading.sheets import Sheet, find_files, read_sheets, sheet_of_frame
 from neuroprior.behaviour.reading.table import JOIN, MAX_OVERLAP, SECONDS, Part, Table, overlapping
 from neuroprior.behaviour.recordings import KEYS, Recordings, Source
+
+MIN_EVENTS, MAX_SHARE_OF_LABELS = 20, 0.5
+"""Events at least, of which this share at most may have a label of their own: what never recurs is no behaviour."""
 
 MIN_TWIN_EVENTS, MIN_TWIN_SHARE = 4, 0.6
 """Events of two recordings, and the share of them at the same time, at least which two observers may have scored."""
@@ -36,8 +40,8 @@ def read(paths: Any, columns: Columns | Mapping[str, Any] | None = None, **optio
 
     Args:
         paths: a file, a folder, a glob, a pandas frame, or a list of these. Text (any separator, UTF-8, UTF-16,
-            Windows-1252), also in .gz and .zip; .xlsx, .xls, .ods, .parquet and .feather need `pip install
-            'neuroprior[tables]'`.
+            Windows-1252), JSON and .npy, also in .gz and .zip; .xlsx, .xls, .ods, .parquet and .feather need
+            `pip install 'neuroprior[tables]'`.
         columns: what columns hold: `Columns`, or a dict of some of its attributes.
         options: how files are read, see `neuroprior.behaviour.reading.Options`.
 
@@ -143,6 +147,8 @@ def _read_file(sheets: list[Sheet], options: Options) -> tuple[list[Part], list[
 def _read_sheet(sheet: Sheet, options: Options) -> Part:
     assert isinstance(options.columns, Columns)
     roles = find_roles(sheet, options.columns, options.words)
+    if roles.layout == "columns of subjects":
+        sheet, roles = melt_subjects(sheet, roles)
     problems = Problems()
     table = Table(sheet, roles, options, problems)
     if not table.size:
@@ -259,6 +265,12 @@ def _combine(parts: list[Part], notes: list[str], options: Options) -> Recording
     unit = _convert_to_one_unit(filled, first)
     _keep_files_apart(filled, first)
     events = pd.concat([part.events for part in filled], ignore_index=True)
+    labels = pd.unique(events["behaviour"])
+    if len(events) >= MIN_EVENTS and len(labels) > MAX_SHARE_OF_LABELS * len(events):
+        raise ReadingError(
+            f"{filled[0].sheet.name}: behaviours must recur, got {len(labels):,} different ones in {len(events):,}"
+            f" events, such as {labels[0]!r} and {labels[-1]!r}; say which column holds them (--columns.behaviour NAME)"
+        )
     offsets = np.cumsum([0, *[int(part.fragment.max()) + 1 for part in filled]])
     fragment = np.concatenate([part.fragment + offset for part, offset in zip(filled, offsets, strict=False)])
     factors = list(dict.fromkeys(name for part in filled for name in part.roles.at.get("factors", [])))

@@ -21,6 +21,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from neuroprior._files import unquote_cell
+from neuroprior.behaviour.reading.documents import check_format, read_array, read_json
 from neuroprior.behaviour.reading.names import KNOWN_NAMES, PROGRAMS, STEM_NUMBER, plain
 from neuroprior.behaviour.reading.problems import ReadingError
 
@@ -31,7 +32,21 @@ NAMED_SEPARATOR = re.compile(r'"?sep=(.)"?\s*', re.IGNORECASE)
 MAX_LINES_ABOVE = 100
 """Lines at most, from the beginning of a file, that may be its header."""
 
-TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".tab", ".xlsx", ".xls", ".ods", ".parquet", ".feather", ".h5", ".xes")
+TABLE_SUFFIXES = (
+    ".csv",
+    ".tsv",
+    ".txt",
+    ".tab",
+    ".xlsx",
+    ".xls",
+    ".ods",
+    ".parquet",
+    ".feather",
+    ".h5",
+    ".xes",
+    ".json",
+    ".npy",
+)
 """Suffixes of the files of a folder that are read; .gz or .zip may follow."""
 
 HEADER_LINES = re.compile(r"number of header lines:?", re.IGNORECASE)
@@ -133,12 +148,32 @@ def _sheets_of_bytes(content: bytes, name: str, label: str, wanted: Sequence[str
         yield sheet_of_frame(_with_extra(label, read, io.BytesIO(content)), label, stem)
     elif content[:8] == b"\x89HDF\r\n\x1a\n":
         yield sheet_of_frame(_with_extra(label, pd.read_hdf, label), label, stem)
+    elif content[:6] == b"\x93NUMPY":
+        yield _sheet_without_header(*read_array(content, label), label, stem)
     elif content.lstrip()[:5] == b"<?xml" and b"<log" in content[:2000]:
         yield _sheet_of_xes(content, label, stem)
     elif content.lstrip()[:9].lower().startswith((b"<!doctype", b"<html", b"<?xml")):
         raise ReadingError(f"{label}: the file must be a table, got a web page or XML")
+    elif _is_json(content, name):
+        yield _sheet_without_header(*read_json(_decode(content, label)[0], label), label, stem)
     else:
+        check_format(content, label)
         yield _sheet_of_text(content, label, stem, wanted)
+
+
+def _is_json(content: bytes, name: str) -> bool:
+    return name.lower().endswith(".json") or re.match(rb"\s*[\[{]\s*[\[{\"]", content) is not None
+
+
+def _sheet_without_header(frame: pd.DataFrame, header: bool, label: str, stem: str) -> Sheet:
+    """Return a frame as a sheet; without a header its columns are numbered from 1."""
+    if header:
+        return sheet_of_frame(frame, label, stem)
+    frame = frame.set_axis([f"column {number}" for number in range(1, 1 + frame.shape[1])], axis=1)
+    sheet = sheet_of_frame(frame, label, stem)
+    sheet.header = False
+    sheet.notes.append(f"{label} has no header; its columns are numbered from 1")
+    return sheet
 
 
 def _with_extra(label: str, read: Any, source: Any, **options: Any) -> Any:

@@ -233,6 +233,8 @@ class Table:
         """
         start = self.roles.at.get("start", [""])[-1]
         unit, start_unit = _unit_of_name(name), _unit_of_name(start)
+        if not start:
+            self.unit = self.unit or unit
         if not unit or not start_unit or unit == start_unit:
             return times
         if unit in SECONDS and start_unit in SECONDS:

@@ -15,6 +15,9 @@ CLOCK = r"(-?)(?:(\d+):)?(\d+):(\d+(?:[.,]\d*)?)(?: ?([AaPp])[Mm])?"
 DAYS = r"(-?\d+) days?,? ?(?:\+?(\d+):(\d+):(\d+(?:\.\d*)?))?"
 YEAR_FIRST = r"\d{4}([-/.])\d{1,2}\1\d{1,2}(?:[T ]\S.*)?"
 YEAR_LAST = r"(\d{1,2})[-/. ](\d{1,2})[-/. ](\d{4}|\d{2})(?:[T, ]+(\S.*))?"
+HOUR = r"^(\S+[T ])(\d{1,2})((?::\d+)+(?:\.\d*)?)(?: ?([AaPp])\.?[Mm]\.?)?$"
+"""A date, an hour, what follows, and the half of the day."""
+
 MISSING_TIMES = ("", "na", "nan", "n/a", "null", "none", "nat", "-", "<na>", "?", "n.a.")
 THOUSANDS = r"-?\d{1,3}(,\d{3})+(\.\d*)?"
 
@@ -138,11 +141,14 @@ def _clock_seconds(texts: Any, column: _Texts) -> Floats | None:
         return None
     sign = np.where(parts[0] == "-", -1.0, 1.0)
     hours, minutes, seconds = (parts[i].str.replace(",", ".").astype(float) for i in (1, 2, 3))
+    half = parts[4].str.lower()
+    to_the_minute = hours.isna() & half.notna()  # such as 8:30 pm
+    hours, minutes = hours.where(~to_the_minute, minutes), minutes.where(~to_the_minute, seconds)
+    seconds = seconds.where(~to_the_minute, 0.0)
     two = hours.isna() & clock
     if two.any() and not (parts[3][two].str.contains("[.,]") | (minutes[two] > 23)).any():
         right = "a time as h:m:s; two numbers may be hours and minutes, or minutes and seconds"
         column.complain(two, right)
-    half = parts[4].str.lower()
     hours = hours.where(half.isna(), hours % 12 + 12 * (half == "p"))
     values = sign * (3600 * hours.fillna(0) + 60 * minutes + seconds)
     values = values.where((seconds < 60) & (hours.isna() | (minutes < 60)))
@@ -172,9 +178,15 @@ def _date_seconds(texts: Any, column: _Texts, day_first: bool | None) -> Floats:
         r"^(\d{4})[-/.](\d{1,2})[-/.](\d{1,2})", lambda m: f"{m[1]}-{m[2]:0>2}-{m[3]:0>2}", regex=True
     )
     normal = normal.str.replace(r"(:\d+),(\d+)", r"\1.\2", regex=True)
+    normal = normal.str.replace(HOUR, lambda m: f"{m[1]}{_hour(int(m[2]), m[4]):02}{m[3]}", regex=True)
     dates = pd.to_datetime(normal.where(filled), format="ISO8601", utc=True, errors="coerce")
     column.complain(filled & dates.isna(), "a time: a number, h:m:s or a date as year-month-day")
     return np.asarray((dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds(), np.float64)
+
+
+def _hour(hour: int, half: str | None) -> int:
+    """Return the hour of a day in which halves of it may be counted: 12 pm is noon."""
+    return hour if half is None else hour % 12 + 12 * (half.lower() == "p")
 
 
 def over_midnight(values: Floats, unit: NDArray[np.int64]) -> tuple[Floats, int]:

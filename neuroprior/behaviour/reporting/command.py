@@ -38,7 +38,7 @@ def plans(
     if typed[:1] not in (["plans"], ["report"]):  # called from Python
         program, typed = "__main__.py", ["plans", *plans]
     command = f"{program.replace('__main__.py', 'python -m eval')} {shlex.join(typed)}"
-    console, page = Console(markup=False), Path(out) / PAGE
+    console, page = Console(markup=False, emoji=False), Path(out) / PAGE
     shown = False
 
     def show_first(document: Document) -> None:

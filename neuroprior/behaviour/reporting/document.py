@@ -102,7 +102,7 @@ def publish(document: Document, folder: Path) -> None:
         Order 1 is best.
         report: runs/chains/report.html
     """
-    console = Console(markup=False)
+    console = Console(markup=False, emoji=False)
     show(document, console)
     write_document(document, folder)
     console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
@@ -120,7 +120,7 @@ def show_headline(document: Document, console: Console) -> None:
     """Print the sentences at the top."""
     mark = "- " if len(document.said) > 1 else ""
     for sentence in document.said:
-        console.print(f"{mark}{sentence}", highlight=False, markup=False)
+        console.print(f"{mark}{sentence}", highlight=False, markup=False, emoji=False)
 
 
 def write_document(document: Document, folder: Path) -> None:

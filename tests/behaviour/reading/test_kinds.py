@@ -1,5 +1,6 @@
 """Kinds of files that laboratories have, each small: what is right, or what the line of error says."""
 
+import io
 import re
 from pathlib import Path
 from typing import Any
@@ -353,3 +354,152 @@ def test_focal_data_of_jwatcher(study):
     assert rows(found) == [("ant 7", "f", 0.0, None), ("ant 7", "r", 1500.0, None), ("ant 7", "f", 4250.0, None)]
     assert found.unit == "ms"
     assert any("JWatcher" in note for note in found.notes)
+
+
+FRAMES = "aaabbbbccccaaabbcccc", "ccccbbbbaaaabbbbaaaa"
+"""Labels of two subjects at twenty frames."""
+
+
+def bouts_of_frames(step: float = 1.0, begin: float = 0.0) -> list[tuple[Any, ...]]:
+    """Runs of `FRAMES` by hand, of the subjects x and y."""
+    ends = {"x": [3, 7, 11, 14, 16, 20], "y": [4, 8, 12, 16, 20]}
+    return [
+        (subject, label, begin + step * start, begin + step * stop)
+        for subject, labels in (("x", "abcabc"), ("y", "cbaba"))
+        for label, start, stop in zip(labels, [0, *ends[subject][:-1]], ends[subject], strict=True)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("header", "times", "step", "begin", "columns"),
+    [
+        ("frame,{},{}", range(20), 1.0, 0.0, None),
+        ("Time (s),{},{}", [0.5 + i / 4 for i in range(20)], 0.25, 0.5, None),
+        ("clock,{},{}", [f"0:{i // 6:02d}:{i % 6 * 10:02d}" for i in range(20)], 10.0, 0.0, {"start": "clock"}),
+        ("n,{},{}", range(20), 1.0, 0.0, {"subject": "{}:{}"}),
+    ],
+)
+def test_a_column_of_labels_for_each_subject(header, times, step, begin, columns, study):
+    """A row is a frame: its time, or the user, says so."""
+    lines = [f"{time},{x},{y}" for time, x, y in zip(times, *FRAMES, strict=True)]
+    given = columns and {use: name.format("x", "y") for use, name in columns.items()}
+    found = study("\n".join([header.format("x", "y"), *lines]) + "\n", given)
+    assert rows(found) == bouts_of_frames(step, begin)
+    assert "(--columns.behaviour 'x:y' if each row is a sequence)" in str(found.notes)
+
+
+def test_whether_a_row_is_a_frame_or_a_sequence(study):
+    """Subjects are told by their names; what may be either is refused, until the user says which it is."""
+    lines = [f"{x},{y},{x}" for x, y in zip(*FRAMES, strict=True)]
+    mice = study("\n".join(["mouse 2,mouse 5,mouse 9", *lines]) + "\n")
+    assert labels(mice) == [[*"abcabc"], [*"cbaba"], [*"abcabc"]]
+    text = "\n".join(["p3,p5,p8", *lines]) + "\n"
+    with pytest.raises(ValueError, match=r"--columns.subject 'p3:p8'.*--columns.behaviour 'p3:p8'"):
+        study(text)
+    assert labels(study(text, {"subject": "p3:p8"})) == labels(mice)
+    assert labels(study(text, {"behaviour": "p3:p8"}))[:4] == [[*"aca"], [*"aca"], [*"aca"], [*"bcb"]]
+    # A diary: each row is a day, whose cells are as those before them.
+    days = ["wplm"[day % 4] * 7 + "sh"[day % 2] * 6 for day in range(28)]
+    header = ",".join(["date", *(f"h{hour}" for hour in range(13))])
+    diary = [",".join([f"2024-02-{number:02d}", *day]) for number, day in enumerate(days, 1)]
+    assert labels(study("\n".join([header, *diary]) + "\n")) == [[*day] for day in days]
+
+
+def array(values: Any) -> bytes:
+    """The bytes of a `.npy` file."""
+    file = io.BytesIO()
+    np.save(file, values)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("content", "name"),
+    [
+        ('[{"animal": "m1", "what": {"behaviour": "a"}}, {"animal": "m2", "what": {"behaviour": "b"}}]', "f.json"),
+        ('{"animal": "m1", "behaviour": "a"}\n{"animal": "m2", "behaviour": "b"}\n', "f.json"),
+        ('{"animal": {"0": "m1", "5": "m2"}, "behaviour": {"0": "a", "5": "b"}}', "f.json"),
+        ('{"study": {"animal": ["m1", "m2"], "behaviour": ["a", "b"]}}', "f.json"),
+        ('{"columns": ["animal", "behaviour"], "index": [0, 1], "data": [["m1", "a"], ["m2", "b"]]}', "f.txt"),
+        (array(np.array([("m1", "a"), ("m2", "b")], [("animal", "U2"), ("behaviour", "U1")])), "f.npy"),
+    ],
+)
+def test_documents_are_tables(content, name, study):
+    assert rows(study(content, name=name)) == [("m1", "a", None, None), ("m2", "b", None, None)]
+
+
+@pytest.mark.parametrize(
+    ("content", "name"),
+    [
+        ('{"m1": ["a", "b", "a"], "m2": ["b", "b"]}', "f.json"),
+        ('[["a", "b", "a"], ["b", "b"]]', "f.json"),
+        ('[{"id": "m1", "labels": ["a", "b", "a"]}, {"id": "m2", "labels": ["b", "b"]}]', "f.json"),
+        (array(np.array([["a", "b", "a"], ["b", "b", ""]])), "f.npy"),
+    ],
+)
+def test_documents_are_sequences(content, name, study):
+    assert labels(study(content, name=name)) == [[*"aba"], [*"bb"]]
+
+
+def test_an_array_of_labels_is_a_recording(study):
+    found = study(array(np.array([3, 3, 0], np.int16)), name="day 2.npy", merge_repeats=True)
+    assert labels(found) == [["3", "0"]]
+    assert set(found.events["recording"]) == {"day 2"}
+    with pytest.raises(ValueError, match="whole numbers or texts, got float64"):
+        study(array(np.array([0.5, 1.0])), name="f.npy")
+    with pytest.raises(ValueError, match="one or two dimensions"):
+        study(array(np.zeros((2, 2, 2), int)), name="f.npy")
+
+
+@pytest.mark.parametrize(
+    ("content", "name", "words"),
+    [
+        (array([1, 2])[:-3], "f.npy", "whole array"),
+        (array(np.array([{}], object)), "f.npy", "whole array"),
+        (b"\x80\x04\x95 ", "f.pkl", "a pickle"),
+        (b"MATLAB 5.0 MAT-file, Platform", "f.mat", "MATLAB data"),
+        ('{"animal": "m1"', "f.json", "whole JSON"),
+        ('{"animal": "m1", "n": 3}', "f.json", "another form"),
+        ('[{"labels": [["a"]]}]', "f.json", "deeper lists"),
+        ("[" * 100_000, "f.json", "nested too deep"),
+    ],
+)
+def test_files_that_are_no_tables_are_refused_in_a_line(content, name, words, study):
+    with pytest.raises(ValueError, match=words) as error:
+        study(content, name=name)
+    assert name in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+TIMES_OF_DAY = [
+    (["8:00 AM", "12:30 pm", "1:15 PM"], [0, 4.5, 5.25]),
+    (["2024-05-01 8:00 AM", "2024-05-01 12:30:00 pm", "2024-05-02 12:00 am"], [0, 4.5, 16]),
+    (["5/13/2024 8:00 p.m.", "5/13/2024 11:30 p.m.", "5/14/2024 9:30 a.m."], [0, 3.5, 13.5]),
+    (["2024-05-01 8:00", "2024-05-01 09:30", "2024-05-01 10:00"], [0, 1.5, 2]),
+]
+
+
+@pytest.mark.parametrize(("times", "hours"), TIMES_OF_DAY)
+def test_times_of_day_may_count_halves(times, hours, study):
+    text = "animal,behaviour,start\n" + "".join(f"m1,a,{time}\n" for time in times)
+    start = study(text).events["start"].to_numpy(float)
+    assert (start - start[0]).tolist() == [3600 * hour for hour in hours]
+
+
+def test_trials_of_one_choice_are_no_recordings(study):
+    """A column that differs in each row of a subject counts its trials; one that does not tells its sessions apart."""
+    lines = [f"r{1 + row // 6},{1 + row // 3 % 2},{1 + row % 6},{'LRRLLR'[row % 5]},{row % 2}" for row in range(12)]
+    found = study("\n".join(["subj_id,session,trial,choice,reward", *lines]) + "\n")
+    assert labels(found) == [[*"LRR"], [*"LLL"], [*"RRL"], [*"LLR"]]
+    assert found.events["subject"].nunique() == 2
+    found = study("\n".join(["worker_id,trial,picked", *(line[:3] + line[5:-2] for line in lines)]) + "\n")
+    assert labels(found) == [[*"LRRLLL"], [*"RRLLLR"]]
+
+
+def test_what_never_recurs_is_no_behaviour(study):
+    songs = "\n".join(f"song{row}" for row in range(20))
+    with pytest.raises(ValueError, match=r"must recur, got 20 different ones in 20 events, such as 'song0'"):
+        study(songs + "\n", name="songs.txt")
+
+
+def test_the_unit_of_durations_alone(study):
+    assert study("animal,behaviour,dur_ms\nm1,a,20\nm1,b,7\n").unit == "ms"
