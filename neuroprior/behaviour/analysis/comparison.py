@@ -110,8 +110,8 @@ def score_bits(model: str, inputs: str, bits: Tensor, plans: Plans, mask: Tensor
         raise ValueError(f"`plans` must have at least two held-out actions, got {int(mask.sum())}.")
     totals = torch.zeros(size, dtype=torch.double).index_add_(0, unit, bits[mask].double())
     scored = hashlib.sha256()
-    for part in (within.sum(1), plans.actions.cpu()[within].long(), mask[within]):
-        scored.update(part.numpy().tobytes())
+    for values in (within.sum(1), plans.actions.cpu()[within].long(), mask[within]):
+        scored.update(values.numpy().tobytes())
     return Score(model, inputs, totals, unit.bincount(minlength=size).double(), scored.hexdigest())
 
 
@@ -238,7 +238,7 @@ def baselines(
 
     Example:
         >>> plans = Plans(torch.randint(2, (40, 6), generator=torch.Generator().manual_seed(0)), 2)
-        >>> [found.model for found in baselines(plans[:30], plans[30:])][:3]
+        >>> [baseline.model for baseline in baselines(plans[:30], plans[30:])][:3]
         ['uniform', 'markov-0', 'markov-1']
     """
     contexts: list[int | None] = [num_contexts] if num_contexts is None or always_context else [None, num_contexts]
@@ -267,13 +267,13 @@ def _chains(training: Plans, order: int, contexts: list[int | None], validation:
         yield f"{prior.backoff} {prior.smoothing:g}", prior
 
 
-def _best(model: str, made: Iterable[tuple[str, Prior]], validation: Plans) -> Baseline:
+def _best(model: str, candidates: Iterable[tuple[str, Prior]], validation: Plans) -> Baseline:
     """The one with the highest likelihood of `validation`; at most two are in memory at a time."""
     best = Baseline(model, "too large", None, inf)
     try:
-        for how, prior in made:
-            found = score(model, prior, validation)
-            bits = float(found.bits.sum() / found.actions.sum())
+        for how, prior in candidates:
+            validation_score = score(model, prior, validation)
+            bits = float(validation_score.bits.sum() / validation_score.actions.sum())
             if bits < best.validation_bits:
                 best = Baseline(model, how, prior, bits)
     except TooLargeError:

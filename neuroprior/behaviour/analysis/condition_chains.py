@@ -22,7 +22,7 @@ class _Counts(NamedTuple):
     block: Tensor  # int64 [Z], ascending
     column: Tensor  # int64 [Z]
     times: Tensor  # float64 [Z]
-    own: Tensor  # float64 [Z, S]: of the same column in the S blocks of the same unit
+    unit_times: Tensor  # float64 [Z, S]: of the same column in the S blocks of the same unit
     matrix: sparse.csr_array  # [K, B]
 
     @staticmethod
@@ -33,23 +33,23 @@ class _Counts(NamedTuple):
         row, column = codes.div(width, rounding_mode="floor"), codes % width
         wanted = blocks[row] * width + column[:, None]
         at = torch.searchsorted(codes, wanted).clamp(max=len(codes) - 1)
-        own = torch.where(codes[at] == wanted, times[at], 0).double()
+        unit_times = torch.where(codes[at] == wanted, times[at], 0).double()
         times = times.double()
         matrix = sparse.csr_array((times, (column, row)), (width, len(blocks)))
-        return _Counts(row, column, times, own, matrix)
+        return _Counts(row, column, times, unit_times, matrix)
 
     def without_unit(self, taken: Tensor, blocks: Tensor) -> Tensor:
         """`[Z, P]`: how often the column occurred in the blocks `taken [B, P]` (0 or 1) of all other units."""
-        found = torch.from_numpy(self.matrix @ taken.numpy())[self.column]
-        for own, sibling in zip(self.own.T, blocks.T, strict=True):
-            found.addcmul_(own[:, None], taken[sibling][self.block], value=-1)
-        return found
+        totals = torch.from_numpy(self.matrix @ taken.numpy())[self.column]
+        for block_times, sibling in zip(self.unit_times.T, blocks.T, strict=True):
+            totals.addcmul_(block_times[:, None], taken[sibling][self.block], value=-1)
+        return totals
 
     def place(self, block: Tensor, column: Tensor) -> Tensor:
         """Where the counts of these columns in these blocks are; all of them occurred."""
         width = int(self.column.max()) + 1
-        found: Tensor = torch.searchsorted(self.block * width + self.column, block * width + column)
-        return found
+        places: Tensor = torch.searchsorted(self.block * width + self.column, block * width + column)
+        return places
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +115,7 @@ class ConditionChains:
         Returns:
             float64 `[C, B, P]`, in bits.
         """
-        found = torch.empty(num, *labellings.shape, dtype=torch.double)
+        gains = torch.empty(num, *labellings.shape, dtype=torch.double)
         size = max(CELLS_AT_ONCE // self.cost, 1)
         for at in range(0, labellings.shape[1], size):
             for condition in range(num):
@@ -124,5 +124,5 @@ class ConditionChains:
                 for counts, added, sign in ((self._cells, self._prior, 1), (self._rows, 1, -1)):
                     logs = counts.without_unit(taken, self._blocks).add_(SMOOTHING * added).log2_()
                     sums.index_add_(0, counts.block, logs.mul_(counts.times[:, None]), alpha=sign)
-                found[condition, :, at : at + size] = sums
-        return found
+                gains[condition, :, at : at + size] = sums
+        return gains

@@ -242,8 +242,8 @@ def compare_conditions(
         >>> first, second = torch.tensor([[0, 1] * 10]).repeat(8, 1), torch.tensor([[0, 0, 1, 1] * 5]).repeat(8, 1)
         >>> condition = torch.arange(16) // 8
         >>> plans = RecordedPlans(torch.cat([first, second]), 2, group=torch.arange(16), condition=condition)
-        >>> found = compare_conditions(plans, permutations=199, generator=torch.Generator().manual_seed(0))
-        >>> found.p_value < 0.05
+        >>> comparison = compare_conditions(plans, permutations=199, generator=torch.Generator().manual_seed(0))
+        >>> comparison.p_value < 0.05
         True
     """
     if isinstance(plans, Recordings):
@@ -251,18 +251,18 @@ def compare_conditions(
     check_are_plans(plans)
     plans = RecordedPlans.of(plans)
     check_sizes(permutations=permutations)
-    found = _compare(plans, permutations, generator)
-    if len(found.condition_names) < 3 or found.prediction is None:
-        return found
+    comparison = _compare(plans, permutations, generator)
+    if len(comparison.condition_names) < 3 or comparison.prediction is None:
+        return comparison
     assert plans.condition is not None
     pairs = [
         _compare(plans[torch.isin(plans.condition, torch.stack(pair))], permutations, generator, with_strata=False)
-        for pair in combinations(found.design.conditions.to(plans.actions.device), 2)
+        for pair in combinations(comparison.design.conditions.to(plans.actions.device), 2)
     ]
-    contrasts = _correct_pairs(found, [pair for pair in pairs if pair.prediction is not None])
+    contrasts = _correct_pairs(comparison, [pair for pair in pairs if pair.prediction is not None])
     differing = [" and ".join(pair.condition_names) for pair in contrasts if pair.conclusive and pair.p_value < LEVEL]
     said = f" Of two conditions, there differ {'; '.join(differing)} (corrected)." if differing else ""
-    return replace(found, contrasts=contrasts, verdict=found.verdict + said)
+    return replace(comparison, contrasts=contrasts, verdict=comparison.verdict + said)
 
 
 def _compare(
@@ -277,19 +277,19 @@ def _compare(
     strata = numbered_names(plans.stratum_names, design.strata, "stratum")
     kept = (design.block >= 0).to(plans.actions.device)
     plans, of_plan = plans[kept], design.block[design.block >= 0]
-    flat = _on_cpu(FlatPlans.of(plans))
+    flat = _move_to_cpu(FlatPlans.of(plans))
     block = of_plan[flat.plan]
-    found = [_Numbers(*family, design) for family in _counted(plans, flat, block, len(design.label))]
+    family_numbers = [_Numbers(*family, design) for family in _count_families(plans, flat, block, len(design.label))]
     chains = ConditionChains.of(flat, block, design.unit, design.stratum)
     num = len(names)
-    cost = num * (chains.cost + sum(numbers.smoothed.numel() for numbers in found) // 8)
+    cost = num * (chains.cost + sum(numbers.smoothed.numel() for numbers in family_numbers) // 8)
     drawn = min(permutations, max(MAX_WORK // max(cost, 1), FEWEST_PERMUTATIONS))
     labellings = design.labellings(drawn, generator)
     families, statistics = [], {}
-    for numbers in found:
-        family, statistics[numbers.name] = _tested(numbers, design, labellings)
+    for numbers in family_numbers:
+        family, statistics[numbers.name] = _test_family(numbers, design, labellings)
         families.append(family)
-    prediction, statistics["bits"], statistics["classifier"] = _predicted(
+    prediction, statistics["bits"], statistics["classifier"] = _predict(
         chains, design, labellings, block.bincount().double()
     )
     tests, p_value = combine_tests(statistics)
@@ -299,7 +299,7 @@ def _compare(
     exact = design.possible <= drawn + 1
     interaction = None
     if with_strata and len(strata) > 1:
-        smoothed = [(numbers.name, numbers.features, numbers.smoothed) for numbers in found]
+        smoothed = [(numbers.name, numbers.features, numbers.smoothed) for numbers in family_numbers]
         interaction = compare_strata(design, strata, smoothed, drawn, generator)
     return ConditionComparison(
         design,
@@ -328,12 +328,12 @@ def _correct_pairs(whole: ConditionComparison, pairs: list[ConditionComparison])
     every = correct([pair.p_value for pair in pairs], whole.p_value)
     names = [name for name in whole.tests if all(name in pair.tests for pair in pairs)]
     of_tests = {name: correct([pair.tests[name][1] for pair in pairs], whole.tests[name][1]) for name in names}
-    found = []
+    contrasts = []
     for place, (pair, p_value) in enumerate(zip(pairs, every, strict=True)):
         tests = {name: (pair.tests[name][0], of_tests[name][place]) for name in names}
         verdict = _verdict(pair.design, pair.condition_names, tests, p_value, pair.smallest_p, pair.conclusive)
-        found.append(replace(pair, tests=tests, p_value=p_value, verdict=verdict))
-    return found
+        contrasts.append(replace(pair, tests=tests, p_value=p_value, verdict=verdict))
+    return contrasts
 
 
 class _Numbers:
@@ -351,11 +351,11 @@ class _Numbers:
         self.smoothed = (above + SMOOTHING * usual) / (below + SMOOTHING)
 
 
-def _on_cpu(flat: FlatPlans) -> FlatPlans:
+def _move_to_cpu(flat: FlatPlans) -> FlatPlans:
     return FlatPlans(flat.actions.cpu(), flat.plan.cpu(), flat.place.cpu(), flat.num_actions)
 
 
-def _counted(
+def _count_families(
     plans: RecordedPlans, flat: FlatPlans, block: Tensor, num: int
 ) -> Iterator[tuple[str, Tensor, Tensor, Tensor]]:
     """Name, features `[F, n]`, and the two sums `[B, F]` whose ratio is the number of a block, of each family."""
@@ -399,10 +399,10 @@ def _sums(
     return features, sums, counts
 
 
-def _tested(numbers: _Numbers, design: PermutationDesign, labellings: Tensor) -> tuple[ConditionFamily, Tensor]:
+def _test_family(numbers: _Numbers, design: PermutationDesign, labellings: Tensor) -> tuple[ConditionFamily, Tensor]:
     """The family, and its largest statistic under each labelling `[P]`."""
     compute = partial(_statistics, numbers.smoothed, design)
-    found = largest_statistics(compute, labellings, len(numbers.features))
+    test = largest_statistics(compute, labellings, len(numbers.features))
     means, low, high, difference = _estimates(numbers, design)
     family = ConditionFamily(
         numbers.name,
@@ -412,10 +412,10 @@ def _tested(numbers: _Numbers, design: PermutationDesign, labellings: Tensor) ->
         low,
         high,
         difference,
-        *found[:3],
-        float(found.corrected.min()),
+        *test[:3],
+        float(test.corrected.min()),
     )
-    return family, found.largest
+    return family, test.largest
 
 
 def _statistics(values: Tensor, design: PermutationDesign, labellings: Tensor) -> Tensor:
@@ -478,10 +478,10 @@ def _stratified_gap(values: Tensor, weights: Tensor, design: PermutationDesign) 
     values = values - _stratum_means(values, weights, design)
     scale = (weights * second.square()).sum(0)
     gap = (weights * second * values).sum(0) / scale
-    part = (weights * second * (values - gap * second) / scale).square()
-    own = torch.stack([design.label == 0, design.label == 1]).double()
-    freedom = own @ (weights > 0).double() - (len(design.strata) + 1) / 2
-    variance = own @ part * (1 + (len(design.strata) + 1) / 2 / torch.where(freedom > 0, freedom, nan))
+    squares = (weights * second * (values - gap * second) / scale).square()
+    by_condition = torch.stack([design.label == 0, design.label == 1]).double()
+    freedom = by_condition @ (weights > 0).double() - (len(design.strata) + 1) / 2
+    variance = by_condition @ squares * (1 + (len(design.strata) + 1) / 2 / torch.where(freedom > 0, freedom, nan))
     return gap, variance.sum(0).sqrt(), variance.sum(0).square() / (variance.square() / freedom).sum(0)
 
 
@@ -509,7 +509,7 @@ def _half(error: Tensor, freedom: Tensor) -> Tensor:
     return torch.where(error == 0, 0, student * error)
 
 
-def _predicted(
+def _predict(
     chains: ConditionChains, design: PermutationDesign, labellings: Tensor, actions: Tensor
 ) -> tuple[ConditionPrediction, Tensor, Tensor]:
     """The prediction; the bits that knowing the condition saves, and the accuracy, under each labelling `[P]`."""
@@ -524,10 +524,10 @@ def _predicted(
     for condition, size in enumerate(design.sizes):
         share += (credit * (labellings == condition)).sum(0) / (num * size)
     odds = (num * gains - gains.sum(0)) / (num - 1)
-    own = (num * right - gains.sum(0)) / (num - 1) / actions[:, None]
+    right_odds = (num * right - gains.sum(0)) / (num - 1) / actions[:, None]
     # Accuracies differ by no less than this: of equal ones the larger log odds are the better.
     step = 1 / (2 * num * lcm(*design.sizes))
-    order = share + step * torch.tanh(own.mean(0)) / 2
+    order = share + step * torch.tanh(right_odds.mean(0)) / 2
     units = len(design.units)
     saved = torch.zeros(units, dtype=torch.double).index_add_(0, design.unit, right[:, 0])
     sizes = torch.zeros(units, dtype=torch.double).index_add_(0, design.unit, actions)

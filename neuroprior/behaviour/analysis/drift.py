@@ -126,18 +126,18 @@ def by_position(plans: Plans, bits: Tensor, mask: Tensor, parts: int = 10) -> Po
         4
     """
     check_sizes(parts=parts)
-    counted = _counted(*_joined(plans, bits, mask))
+    counted = _count_actions(*_join_plans(plans, bits, mask))
     place = counted.place
-    part = (place * parts).long().clamp(max=parts - 1)
-    found = []
+    part_index = (place * parts).long().clamp(max=parts - 1)
+    intervals = []
     for k in range(parts):
-        here = part == k
-        found.append(_interval(counted.bits[here], counted.unit[here]) if here.any() else Interval(nan, nan, nan))
-    off, excess = _about_means(place, counted.plan), _about_means(counted.bits, counted.plan)
+        kept = part_index == k
+        intervals.append(_interval(counted.bits[kept], counted.unit[kept]) if kept.any() else Interval(nan, nan, nan))
+    off, excess = _deviations(place, counted.plan), _deviations(counted.bits, counted.plan)
     if float(off.square().sum()) < 1e-12:
         raise ValueError("`mask` must have two actions of one plan, for a trend within plans.")
     trend = ratio_difference(_sums(off * excess, counted.unit), _sums(off.square(), counted.unit))
-    return PositionDrift(found, part.bincount(minlength=parts).cpu(), trend)
+    return PositionDrift(intervals, part_index.bincount(minlength=parts).cpu(), trend)
 
 
 def by_plan(plans: Plans, bits: Tensor, mask: Tensor) -> PlanDrift:
@@ -151,10 +151,10 @@ def by_plan(plans: Plans, bits: Tensor, mask: Tensor) -> PlanDrift:
 
     Example:
         >>> plans = Plans(torch.tensor([[0, 1], [0, 0], [1, 1], [1, 0]]), 2)
-        >>> found = by_plan(plans, action_bits(UniformPrior(2), plans), plans.mask())
+        >>> drift = by_plan(plans, action_bits(UniformPrior(2), plans), plans.mask())
     """
-    plans, bits, mask = _joined(plans, bits, mask)
-    item, index, group, totals, actions = _items(plans, _counted(plans, bits, mask))
+    plans, bits, mask = _join_plans(plans, bits, mask)
+    item, index, group, totals, actions = _items(plans, _count_actions(plans, bits, mask))
     numbers, inverse = group.unique(return_inverse=True)
     first = torch.full((len(numbers),), len(group)).scatter_reduce(0, inverse, torch.arange(len(group)), "amin")
     order = first[inverse].argsort(stable=True)
@@ -162,9 +162,9 @@ def by_plan(plans: Plans, bits: Tensor, mask: Tensor) -> PlanDrift:
     correlations: dict[int, Difference] = {}
     starts = first.sort().indices  # ranks of groups in the order of their first plan
     sizes = inverse.bincount(minlength=len(numbers))[starts].tolist()
-    for number, part in zip(numbers[starts].tolist(), surprisal.split(sizes), strict=True):
-        if len(part) >= FEWEST_RANKED:
-            correlations[number] = _rank_correlation(_rounded(part.numpy()))
+    for number, group_bits in zip(numbers[starts].tolist(), surprisal.split(sizes), strict=True):
+        if len(group_bits) >= FEWEST_RANKED:
+            correlations[number] = _rank_correlation(_round(group_bits.numpy()))
     means = [one.mean for one in correlations.values()]
     trend = next(iter(correlations.values()), None)
     if len(means) >= FEWEST_UNITS:
@@ -183,25 +183,25 @@ def by_group(plans: Plans, bits: Tensor, mask: Tensor) -> GroupDrift:
 
     Example:
         >>> plans = Plans(torch.tensor([[0, 1], [0, 0], [1, 1], [1, 0]]), 2, group=torch.tensor([0, 0, 1, 1]))
-        >>> found = by_group(plans, action_bits(UniformPrior(2), plans), plans.mask())
+        >>> drift = by_group(plans, action_bits(UniformPrior(2), plans), plans.mask())
     """
-    plans, bits, mask = _joined(plans, bits, mask)
-    _, _, group, totals, actions = _items(plans, _counted(plans, bits, mask))
+    plans, bits, mask = _join_plans(plans, bits, mask)
+    _, _, group, totals, actions = _items(plans, _count_actions(plans, bits, mask))
     order = group.argsort(stable=True)
     numbers, sizes = group.unique(return_counts=True)
     parts = list(zip(totals[order].split(sizes.tolist()), actions[order].split(sizes.tolist()), strict=True))
-    found = {number: _ratio(*part) for number, part in zip(numbers.tolist(), parts, strict=True)}
+    means = {number: _ratio(*sums) for number, sums in zip(numbers.tolist(), parts, strict=True)}
     several = [(total / size).numpy() for total, size in parts if len(size) > 1]
     if len(several) < FEWEST_UNITS:
-        return GroupDrift(found, None)
-    together = _rounded(np.concatenate(several))
+        return GroupDrift(means, None)
+    together = _round(np.concatenate(several))
     if (together == together[0]).all():
-        return GroupDrift(found, 1.0)
-    ends = np.cumsum([len(part) for part in several])[:-1]
-    return GroupDrift(found, float(stats.kruskal(*np.split(together, ends)).pvalue))
+        return GroupDrift(means, 1.0)
+    ends = np.cumsum([len(values) for values in several])[:-1]
+    return GroupDrift(means, float(stats.kruskal(*np.split(together, ends)).pvalue))
 
 
-def _joined(plans: Plans, bits: Tensor, mask: Tensor) -> tuple[Plans, Tensor, Tensor]:
+def _join_plans(plans: Plans, bits: Tensor, mask: Tensor) -> tuple[Plans, Tensor, Tensor]:
     """The plans, bits and mask with the fragments of each recording joined to one plan, after checks."""
     check_are_plans(plans)
     shape = plans.actions.shape
@@ -217,7 +217,7 @@ def _joined(plans: Plans, bits: Tensor, mask: Tensor) -> tuple[Plans, Tensor, Te
     return plans, bits, mask
 
 
-def _counted(plans: Plans, bits: Tensor, mask: Tensor) -> _Counted:
+def _count_actions(plans: Plans, bits: Tensor, mask: Tensor) -> _Counted:
     """The actions that count, after checks; on the device of `bits`. The fragments of a recording are one plan."""
     mask = mask.to(bits.device)
     if not bool(bits[mask].isfinite().all()):
@@ -260,7 +260,7 @@ def _sums(values: Tensor, index: Tensor, num: int | None = None) -> Tensor:
     return values.new_zeros(size).index_add_(0, index, values)
 
 
-def _about_means(values: Tensor, plan: Tensor) -> Tensor:
+def _deviations(values: Tensor, plan: Tensor) -> Tensor:
     """Values `[M]` less the mean of their plan."""
     means = _sums(values, plan) / plan.bincount().clamp(min=1)
     return values - means[plan]
@@ -279,7 +279,7 @@ def _ratio(totals: Tensor, sizes: Tensor) -> Interval:
     return Interval(*ratio_difference(totals, sizes)[:3])
 
 
-def _rounded(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _round(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Values to be ranked, rounded to `DIGITS` digits of the largest: means of the same bits are equal then."""
     largest = float(np.abs(values).max())
     return np.round(values / largest, DIGITS) if largest > 0 else values

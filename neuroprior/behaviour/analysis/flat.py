@@ -45,5 +45,5 @@ def ranks(codes: Tensor) -> Tensor:
     A sequence of k actions has the code of its first k - 1 times A plus the last. Codes of long sequences would
     overflow; ranks, which take their place before the next action is added, do not.
     """
-    found: Tensor = torch.unique(codes, return_inverse=True)[1]
-    return found
+    inverse: Tensor = torch.unique(codes, return_inverse=True)[1]
+    return inverse

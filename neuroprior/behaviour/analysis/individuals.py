@@ -77,8 +77,8 @@ class Individuals:
         most = np.argsort(-np.abs(flat), axis=1, kind="stable")[:, :listed]
         names, size = self.action_names, len(self.action_names)
         frame["differs_in"] = [
-            ", ".join(f"{names[c // size]} → {names[c % size]} {100 * own[c]:+.0f} %" for c in cells)
-            for own, cells in zip(flat, most, strict=True)
+            ", ".join(f"{names[c // size]} → {names[c % size]} {100 * row[c]:+.0f} %" for c in cells)
+            for row, cells in zip(flat, most, strict=True)
         ]
         return frame.assign(x=self.places[:, 0], y=self.places[:, 1])
 
@@ -95,35 +95,35 @@ def individuals(plans: RecordedPlans | Recordings, generator: torch.Generator | 
 
     Example:
         >>> actions = torch.tensor([[0, 1] * 20, [0, 1] * 20, [0, 0, 1, 1] * 10])
-        >>> found = individuals(RecordedPlans(actions, 2, group=torch.arange(3)), torch.Generator().manual_seed(0))
-        >>> found.frame().individual[found.from_others[:, 0].argmax()]
+        >>> result = individuals(RecordedPlans(actions, 2, group=torch.arange(3)), torch.Generator().manual_seed(0))
+        >>> result.frame().individual[result.from_others[:, 0].argmax()]
         'group 2'
     """
     names, action_names, counts = _counts(plans)
     draws = np.random.default_rng(int(torch.randint(2**31, (), generator=generator_on(generator, "cpu"))))
     total = counts.sum(0)
     weight = total.sum(1) / total.sum()
-    probs = _smoothed(counts, total)
-    distances = np.stack([_distance(probs, own, weight) for own in probs])
-    rest = _smoothed(total - counts, total)
-    own = _distance(probs, rest, weight)
+    probs = _smooth(counts, total)
+    distances = np.stack([_distance(probs, row, weight) for row in probs])
+    rest = _smooth(total - counts, total)
+    observed = _distance(probs, rest, weight)
     sizes = counts.sum(-1).astype(np.int64)
 
     def drawn_from(base: Array) -> Array:
         """The distances `[DRAWS, S]` from the others of individuals drawn with transition probabilities `base`."""
-        found = []
+        rows = []
         for _ in range(DRAWS):
             sample = draws.multinomial(sizes, base).astype(np.float64)
             whole = sample.sum(0)
-            found.append(_distance(_smoothed(sample, total), _smoothed(whole - sample, total), weight))
-        return np.stack(found)
+            rows.append(_distance(_smooth(sample, total), _smooth(whole - sample, total), weight))
+        return np.stack(rows)
 
     # Drawn ones are noisier than what they were drawn from: their distances are too large by as much.
     spread = drawn_from(probs)
-    low, high = (own + np.quantile(spread - np.median(spread, axis=0), level, axis=0) for level in (0.025, 0.975))
-    alike = drawn_from(np.broadcast_to(_smoothed(total, total), probs.shape))
-    from_others, chance = np.stack([own, low.clip(min=0), high], 1), np.quantile(alike, 0.95, axis=0)
-    return Individuals(names, action_names, probs, distances, _scaled(distances), from_others, chance)
+    low, high = (observed + np.quantile(spread - np.median(spread, axis=0), level, axis=0) for level in (0.025, 0.975))
+    alike = drawn_from(np.broadcast_to(_smooth(total, total), probs.shape))
+    from_others, chance = np.stack([observed, low.clip(min=0), high], 1), np.quantile(alike, 0.95, axis=0)
+    return Individuals(names, action_names, probs, distances, _scale(distances), from_others, chance)
 
 
 def _counts(plans: RecordedPlans | Recordings) -> tuple[list[str], list[str], Array]:
@@ -143,27 +143,27 @@ def _counts(plans: RecordedPlans | Recordings) -> tuple[list[str], list[str], Ar
     return names, action_names(plans), counts.double().numpy()
 
 
-def _smoothed(counts: Array, total: Array) -> Array:
+def _smooth(counts: Array, total: Array) -> Array:
     """Transition probabilities `[..., A, A]` of counts, with `PRIOR_COUNTS` more as in `total [A, A]`."""
     usual = (total + 1e-9) / (total + 1e-9).sum(1, keepdims=True)
     smoothed: Array = (counts + PRIOR_COUNTS * usual) / (counts.sum(-1, keepdims=True) + PRIOR_COUNTS)
     return smoothed
 
 
-def _distance(some: Array, others: Array, weight: Array) -> Array:
+def _distance(probs: Array, others: Array, weight: Array) -> Array:
     """The distance of transition probabilities `[..., A, A]` with rows of this weight `[A]`."""
-    distance: Array = np.sqrt((divergence(some, others) * weight).sum(-1))
+    distance: Array = np.sqrt((divergence(probs, others) * weight).sum(-1))
     return distance
 
 
-def divergence(some: Array, others: Array) -> Array:
+def divergence(probs: Array, others: Array) -> Array:
     """The Jensen-Shannon divergence `[...]`, in bits, of probabilities `[..., A]`."""
-    middle = (some + others) / 2
-    bits: Array = (rel_entr(some, middle) + rel_entr(others, middle)).sum(-1) / (2 * np.log(2))
+    middle = (probs + others) / 2
+    bits: Array = (rel_entr(probs, middle) + rel_entr(others, middle)).sum(-1) / (2 * np.log(2))
     return bits.clip(min=0)
 
 
-def _scaled(distances: Array) -> Array:
+def _scale(distances: Array) -> Array:
     """Places `[S, 2]` whose distances are as near as possible to these."""
     squares = distances**2
     centred = -(squares - squares.mean(0) - squares.mean(1, keepdims=True) + squares.mean()) / 2
@@ -232,7 +232,7 @@ def individual_types(plans: RecordedPlans | Recordings, generator: torch.Generat
     scores = np.zeros((most, len(names)))
     for number in range(1, most + 1):
         for held_out in range(5):
-            log_weights, log_probs = _fitted(counts[fold != held_out], number, draws)
+            log_weights, log_probs = _fit_mixture(counts[fold != held_out], number, draws)
             scores[number - 1, fold == held_out] = logsumexp(
                 log_weights + np.einsum("sab,kab->sk", counts[fold == held_out], log_probs), axis=1
             )
@@ -242,7 +242,7 @@ def individual_types(plans: RecordedPlans | Recordings, generator: torch.Generat
     more = gaps.sum(1) / sizes.sum()
     error = np.sqrt(len(names) * (gaps - more[:, None] * sizes).var(1, ddof=1)) / sizes.sum()
     number = int(np.argmax(more <= error)) + 1
-    log_weights, log_probs = _fitted(counts, number, draws)
+    log_weights, log_probs = _fit_mixture(counts, number, draws)
     logits = log_weights + np.einsum("sab,kab->sk", counts, log_probs)
     shares = np.exp(logits - logsumexp(logits, axis=1, keepdims=True))
     if number == 1:
@@ -257,14 +257,14 @@ def individual_types(plans: RecordedPlans | Recordings, generator: torch.Generat
     return Types(number, bits, more, error, names, shares, sentence)
 
 
-def _fitted(counts: Array, number: int, draws: np.random.Generator) -> tuple[Array, Array]:
+def _fit_mixture(counts: Array, number: int, draws: np.random.Generator) -> tuple[Array, Array]:
     """The logarithms of the weights `[K]` and transition probabilities `[K, A, A]` of the likeliest mixture found."""
     total = counts.sum(0)
     starts = 1 if number == 1 else STARTS
     shares = draws.dirichlet(np.full(number, 0.2), (starts, len(counts)))  # [starts, S, K]
     before = np.full(starts, -np.inf)
     for _ in range(ROUNDS):
-        log_probs = np.log(_smoothed(np.einsum("isk,sab->ikab", shares, counts), total))
+        log_probs = np.log(_smooth(np.einsum("isk,sab->ikab", shares, counts), total))
         log_weights = np.log((shares.sum(1) + 1) / (len(counts) + number))
         logits = log_weights[:, None] + np.einsum("sab,ikab->isk", counts, log_probs)
         whole = logsumexp(logits, axis=2, keepdims=True)

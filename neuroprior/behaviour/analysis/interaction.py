@@ -113,11 +113,11 @@ def compare_strata(
         total = residual.square().sum(0)
         residual[:, total <= ROUNDING * values.square().sum((0, 1)).repeat(values.shape[1])] = 0
         ratio = partial(_ratios, residual, len(features), main, inter)
-        found = largest_statistics(ratio, orders, len(features))
-        statistics[name] = found.largest
+        test = largest_statistics(ratio, orders, len(features))
+        statistics[name] = test.largest
         differences = _differences(numbers, design, len(stratum_names))
-        p_value = float(found.corrected.min())
-        tested.append(InteractionFamily(name, features, differences, *found[:3], p_value))
+        p_value = float(test.corrected.min())
+        tested.append(InteractionFamily(name, features, differences, *test[:3], p_value))
     tests, p_value = combine_tests(statistics)
     enough = ", ".join(name for name, (_, corrected) in tests.items() if corrected < LEVEL)
     where = f"the difference between conditions depends on the stratum ({', '.join(stratum_names)}; {p_words(p_value)})"
@@ -132,9 +132,10 @@ def _ratios(residual: Tensor, features: int, main: Tensor, inter: Tensor, orders
     """`[F, p]`: the squares of the interaction by those that remain, with units in each of `orders [units, p]`."""
     bases = torch.cat([main, inter], 1)[orders].flatten(1)  # rows of the design move, which is as if units did
     squares = (residual.T @ bases).view(-1, features, orders.shape[1], main.shape[1] + inter.shape[1]).square().sum(0)
-    own, total = squares[..., main.shape[1] :].sum(-1), residual.square().sum(0).view(-1, features).sum(0)[:, None]
+    explained = squares[..., main.shape[1] :].sum(-1)
+    total = residual.square().sum(0).view(-1, features).sum(0)[:, None]
     rest = (total - squares.sum(-1)).clamp(min=LEAST_RESIDUAL * total)
-    return own / torch.where(total > 0, rest, 1)
+    return explained / torch.where(total > 0, rest, 1)
 
 
 def _differences(numbers: Tensor, design: PermutationDesign, strata: int) -> Tensor:

@@ -127,12 +127,12 @@ def how_far_back(plans: Plans, max_lag: int = 4, skip: int = 0) -> HowFarBack:
     history, bits = np.zeros(len(actions), np.int64), bits_of_shares(actions, fold, plans.num_actions)
     gains, above = list[Difference](), list[float]()
     for lag in range(1, max_lag + 1):
-        known = step >= lag
-        inside = known & (step >= skip)
+        has_history = step >= lag
+        inside = has_history & (step >= skip)
         if len(np.unique(unit[inside])) < 2:
             break
         history = np.unique(history * plans.num_actions + np.roll(actions, lag), return_inverse=True)[1]
-        better = bits_after(history, actions, fold, bits, known)
+        better = bits_after(history, actions, fold, bits, has_history)
         gain, size = np.zeros(unit.max() + 1), np.bincount(unit[inside], minlength=unit.max() + 1)
         np.add.at(gain, unit[inside], (bits - better)[inside])
         gain, size = np.round(gain, 9)[size > 0], size[size > 0]
@@ -178,19 +178,19 @@ def bits_of_shares(actions: Array, fold: Array, size: int) -> Array:
     return np.asarray(-np.log2(others[fold, actions] / others.sum(1)[fold]))
 
 
-def bits_after(history: Array, actions: Array, fold: Array, lower: Array, known: Array) -> Array:
+def bits_after(history: Array, actions: Array, fold: Array, lower: Array, has_history: Array) -> Array:
     """Return the bits of each action `[M]` after its history, learned in the other folds.
 
     Args:
         history: `[M]`: its number.
         actions, fold: `[M]`.
         lower: `[M]`: the bits after the history without its oldest action; those of unknown histories remain.
-        known: bool `[M]`: whether the history is there.
+        has_history: bool `[M]`: whether the history is there.
     """
     bits = lower.copy()
     for number in np.unique(fold):
-        held_out = known & (fold == number)
-        bits[held_out] = bits_held_out(history, actions, known & (fold != number), held_out, lower)
+        held_out = has_history & (fold == number)
+        bits[held_out] = bits_held_out(history, actions, has_history & (fold != number), held_out, lower)
     return bits
 
 

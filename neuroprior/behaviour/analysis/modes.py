@@ -125,37 +125,37 @@ def choose_modes(
         check_sizes(num_modes=number)
     plans = divisible(plans)
     # Features and patterns cannot be counted.
-    given = plans if use_context and "num_contexts" in context_arguments(plans) else plans.without_context()
+    scored_plans = plans if use_context and "num_contexts" in context_arguments(plans) else plans.without_context()
     generator = generator_on(generator, "cpu")
-    if num_units(given) < FEWEST_UNITS:
+    if num_units(scored_plans) < FEWEST_UNITS:
         raise ValueError(
             "`plans` must be at least two, to learn from some and hold out others; `in_parts` cuts a single one."
         )
     if number_of_folds is None:
-        number_of_folds = min(FOLDS, num_units(given))
-    parts = folds(given, number_of_folds, draw_seed(generator) % 2**31)
-    if mask is not None and (mask.dtype != torch.bool or mask.shape != given.actions.shape):
-        shape = list(given.actions.shape)
+        number_of_folds = min(FOLDS, num_units(scored_plans))
+    parts = folds(scored_plans, number_of_folds, draw_seed(generator) % 2**31)
+    if mask is not None and (mask.dtype != torch.bool or mask.shape != scored_plans.actions.shape):
+        shape = list(scored_plans.actions.shape)
         raise ValueError(f"`mask` must be bool of shape {shape}, got {mask.dtype} {list(mask.shape)}.")
-    mask = given.mask() if mask is None else given.mask() & mask
+    mask = scored_plans.mask() if mask is None else scored_plans.mask() & mask
     scores, priors, stability = {}, {}, {}
-    inputs = ACTIONS if given.context is None else CONTEXT
+    inputs = ACTIONS if scored_plans.context is None else CONTEXT
     for number in numbers:
         make = partial(SwitchingPrior, num_modes=number, **arguments)
 
-        def fitted(some: Plans, make: Any = make) -> SwitchingPrior:
-            prior = make_prior(given, make)
+        def fitted(train_plans: Plans, make: Any = make) -> SwitchingPrior:
+            prior = make_prior(scored_plans, make)
             assert isinstance(prior, SwitchingPrior)
-            return prior.fit(some, generator=generator)
+            return prior.fit(train_plans, generator=generator)
 
-        whole = fitted(given)
-        reference = whole.posterior(given).smoothed
-        bits, agreement = torch.zeros(given.actions.shape, dtype=torch.double), []
+        whole = fitted(scored_plans)
+        reference = whole.posterior(scored_plans).smoothed
+        bits, agreement = torch.zeros(scored_plans.actions.shape, dtype=torch.double), []
         for learned, held_out in parts:
-            prior = fitted(divisible(given[learned]))
-            bits[held_out] = action_bits(prior, given[held_out])
-            agreement.append(agreements(reference, prior.posterior(given).smoothed, given.mask()))
-        scores[number] = score_bits(f"{number} modes", inputs, bits, given, mask)
+            prior = fitted(divisible(scored_plans[learned]))
+            bits[held_out] = action_bits(prior, scored_plans[held_out])
+            agreement.append(agreements(reference, prior.posterior(scored_plans).smoothed, scored_plans.mask()))
+        scores[number] = score_bits(f"{number} modes", inputs, bits, scored_plans, mask)
         priors[number], stability[number] = whole, torch.stack(agreement)
     best = scores[_best(scores)]
     chosen = next(number for number in numbers if le(*_excess(scores[number], best)))
@@ -202,7 +202,7 @@ def mode_names(number: int) -> tuple[str, ...]:
     return tuple(f"mode {k + 1}" for k in range(number))
 
 
-def _scored(prior: SwitchingPrior, plans: Plans) -> Plans:
+def _check_plans(prior: SwitchingPrior, plans: Plans) -> Plans:
     """The plans as the prior takes them."""
     if not isinstance(prior, SwitchingPrior):
         raise ValueError(f"`prior` must be a SwitchingPrior, got {type(prior).__name__}.")
@@ -231,17 +231,17 @@ def mode_plans(prior: SwitchingPrior, plans: AnyPlans) -> AnyPlans:
         >>> mode_plans(prior, plans).num_actions
         2
     """
-    given = _scored(prior, plans)
-    path = prior.posterior(given).path.cpu()
+    scored_plans = _check_plans(prior, plans)
+    path = prior.posterior(scored_plans).path.cpu()
     return replace(plans, actions=path, num_actions=prior.num_modes, action_names=mode_names(prior.num_modes), end=None)
 
 
 def mode_transitions(prior: SwitchingPrior, plans: Plans) -> Tensor:
     """How often each mode took each action after each, in expectation: `[K, A, A]`, float64, last by next action."""
-    given, size = _scored(prior, plans), plans.num_actions
+    scored_plans, size = _check_plans(prior, plans), plans.num_actions
     both, actions = plans.mask()[:, 1:], plans.actions.long()
     pair = (actions[:, :-1] * size + actions[:, 1:])[both]
-    weights = prior.posterior(given).smoothed.cpu()[:, 1:][both]
+    weights = prior.posterior(scored_plans).smoothed.cpu()[:, 1:][both]
     counts = weights.new_zeros(prior.num_modes, size * size)
     return counts.index_add_(1, pair, weights.T).view(-1, size, size)
 
@@ -269,8 +269,8 @@ def mode_frame(prior: SwitchingPrior, plans: Plans) -> Any:
         >>> len(mode_frame(prior, plans))
         120
     """
-    given = _scored(prior, plans)
-    found, mask = prior.posterior(given), plans.mask()
+    scored_plans = _check_plans(prior, plans)
+    posterior, mask = prior.posterior(scored_plans), plans.mask()
     which, step = (index.numpy() for index in mask.nonzero(as_tuple=True))
 
     def named(names: Sequence[str] | None, numbers: Tensor) -> Any:
@@ -281,8 +281,8 @@ def mode_frame(prior: SwitchingPrior, plans: Plans) -> Any:
     if context is not None and "num_contexts" in context_arguments(plans):
         columns["context"] = named(plans.context_names, context[mask].long())
     columns["action"] = named(plans.action_names, plans.actions[mask].long())
-    columns["mode"] = found.path.cpu()[mask].numpy() + 1
-    for what, values in (("filtered", found.filtered), ("smoothed", found.smoothed)):
+    columns["mode"] = posterior.path.cpu()[mask].numpy() + 1
+    for what, values in (("filtered", posterior.filtered), ("smoothed", posterior.smoothed)):
         columns |= {f"{what}_{k + 1}": values[..., k].cpu()[mask].numpy() for k in range(prior.num_modes)}
     return plan_frame(plans).iloc[which].assign(**columns).reset_index(drop=True)
 
@@ -314,10 +314,10 @@ def mode_table(prior: SwitchingPrior, plans: Plans) -> Any:
     """
     import pandas as pd
 
-    given = _scored(prior, plans)
-    found, mask = prior.posterior(given), plans.mask()
-    weights, actions = found.smoothed.cpu()[mask], plans.actions[mask].long()
-    path = found.path.cpu()
+    scored_plans = _check_plans(prior, plans)
+    posterior, mask = prior.posterior(scored_plans), plans.mask()
+    weights, actions = posterior.smoothed.cpu()[mask], plans.actions[mask].long()
+    path = posterior.path.cpu()
     taken = torch.zeros(prior.num_modes, plans.num_actions, dtype=torch.double).index_add_(1, actions, weights.T)
     overall = taken.sum(0) / taken.sum() if prior.num_modes > 1 else taken.new_zeros(plans.num_actions)
     names = plans.action_names or tuple(map(str, range(plans.num_actions)))
@@ -328,18 +328,18 @@ def mode_table(prior: SwitchingPrior, plans: Plans) -> Any:
     if context is not None and varies and "num_contexts" in context_arguments(plans):
         places = plans.context_names or tuple(map(str, range(int(context.max()) + 1)))
     rows = []
-    moves = found.moves.cpu().sum(0)
+    moves = posterior.moves.cpu().sum(0)
     leaves, enters = (moves.sum(by) - moves.diagonal() for by in (1, 0))
-    begun = found.smoothed.cpu()[:, :1][mask[:, :1]].sum(0)
+    begun = posterior.smoothed.cpu()[:, :1][mask[:, :1]].sum(0)
     for k in range(prior.num_modes):
-        own = taken[k] / taken[k].sum().clamp(min=1e-12)
-        most = (own - overall).argsort(descending=True, stable=True)[:3].tolist()
+        shares = taken[k] / taken[k].sum().clamp(min=1e-12)
+        most = (shares - overall).argsort(descending=True, stable=True)[:3].tolist()
         row: dict[str, Any] = {
             "mode": k + 1,
             "share": float(weights[:, k].mean()),
             "dwell": float(moves[k].sum() / leaves[k]) if leaves[k] > MIN_ENDS else inf,
             "visits": float((begun[k] + enters[k]) / len(plans)),
-            "behaviours": ", ".join(f"{names[a]} {own[a]:.2f}" for a in most if own[a] > overall[a]),
+            "behaviours": ", ".join(f"{names[a]} {shares[a]:.2f}" for a in most if shares[a] > overall[a]),
         }
         if places is not None and context is not None:
             for what, of in (("enters", path[:, 1:]), ("leaves", path[:, :-1])):

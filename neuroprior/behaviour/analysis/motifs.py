@@ -98,7 +98,7 @@ def motifs(
 
     Example:
         >>> plans = Plans(torch.tensor([[0, 1, 2, 3, 1, 0, 3, 2, 0, 1, 2, 1]]).repeat(5, 1), 4)
-        >>> [found.actions for found in motifs(plans, lengths=[3], top=1)]
+        >>> [motif.actions for motif in motifs(plans, lengths=[3], top=1)]
         [(3, 1, 0)]
     """
     lengths = as_list("lengths", lengths)
@@ -110,14 +110,14 @@ def motifs(
     if top is not None:
         check_sizes(top=top)
     flat = FlatPlans.of(plans)
-    found, tests = [], 0
+    by_length, tests = [], 0
     for length, middle in _middles(flat, sorted(lengths)):
         start = flat.starts(length)
         windows = _Windows.of(flat, length, start, middle)
         sequences = _candidates(windows, flat.num_actions)
         tests += sequences.tests
-        found.append(_test(flat, length, windows, sequences, _units(plans, flat.place[start])[windows.kept]))
-    return _listed(found, tests, top)
+        by_length.append(_test(flat, length, windows, sequences, _units(plans, flat.place[start])[windows.kept]))
+    return _list_motifs(by_length, tests, top)
 
 
 def _middles(flat: FlatPlans, lengths: list[int]) -> Iterator[tuple[int, Tensor]]:
@@ -200,10 +200,10 @@ def _pairs(
     partners = partners[of_head[head]]
     block = partners.cumsum(0).div(CANDIDATES_AT_ONCE, rounding_mode="floor")
     sizes = block.unique_consecutive(return_counts=True)[1].tolist()
-    for some, number, at in zip(*(values.split(sizes) for values in (head, partners, first)), strict=True):
-        which = torch.arange(len(some), device=some.device).repeat_interleave(number)
-        place = torch.arange(len(which), device=some.device) - (number.cumsum(0) - number)[which]
-        yield some[which], tail[at[which] + place]
+    for head_batch, number, at in zip(*(values.split(sizes) for values in (head, partners, first)), strict=True):
+        which = torch.arange(len(head_batch), device=head_batch.device).repeat_interleave(number)
+        place = torch.arange(len(which), device=head_batch.device) - (number.cumsum(0) - number)[which]
+        yield head_batch[which], tail[at[which] + place]
 
 
 class _Tested(NamedTuple):
@@ -248,13 +248,13 @@ def _half_width(windows: _Windows, sequences: _Sequences, unit: Tensor) -> Tenso
     sizes = unit.bincount().tolist()
     together = max(COUNTS_AT_ONCE // max(len(unit), len(every), 1), 1)
     parts = unit.argsort(stable=True).split([sum(sizes[k : k + together]) for k in range(0, len(sizes), together)])
-    for k, part in enumerate(parts):
-        row = unit[part] - k * together
+    for k, chunk in enumerate(parts):
+        row = unit[chunk] - k * together
 
-        def times(rank: Tensor, wanted: Tensor, part: Tensor = part, row: Tensor = row) -> Tensor:
+        def times(rank: Tensor, wanted: Tensor, chunk: Tensor = chunk, row: Tensor = row) -> Tensor:
             """`[U, K]`: how often each of `wanted [K]` is among the ranks of the windows of each of some units."""
             width = max(int(rank.max()), int(wanted.max())) + 1
-            counts = (row * width + rank[part]).bincount(minlength=(int(row.max()) + 1) * width)
+            counts = (row * width + rank[chunk]).bincount(minlength=(int(row.max()) + 1) * width)
             return counts.view(-1, width)[:, wanted]
 
         if len(every):
@@ -266,7 +266,7 @@ def _half_width(windows: _Windows, sequences: _Sequences, unit: Tensor) -> Tenso
             num_units += (middle > 0).sum(0)
     student = torch.tensor([inf, inf, *stdtrit(range(1, BLOCKS), 0.975)], dtype=torch.double, device=unit.device)
     error = (squares * num_units / (num_units - 1).clamp(min=1)).sqrt()
-    other_heads, other_tails = (1 - part.double() / sequences.total for part in (sequences.heads, sequences.tails))
+    other_heads, other_tails = (1 - counts.double() / sequences.total for counts in (sequences.heads, sequences.tails))
     least = ndtri(0.975) * (other_heads * other_tails / sequences.counts.clamp(min=1)).sqrt()
     return torch.where(num_units < FEWEST_UNITS, inf, (student[num_units] * error).maximum(least))
 
@@ -281,28 +281,28 @@ def _units(plans: Plans, place: Tensor) -> Tensor:
     return joined
 
 
-def _listed(found: list[_Tested], tests: int, top: int | None) -> list[Motif]:
+def _list_motifs(by_length: list[_Tested], tests: int, top: int | None) -> list[Motif]:
     """The first `top` of all, in the order that `motifs` promises."""
-    columns = list(zip(*found, strict=True))[1:]
+    columns = list(zip(*by_length, strict=True))[1:]
     count, expected, low, high, p_value = (torch.cat(values).cpu().numpy() for values in columns)
     corrected = holm(p_value, tests)
     over, clear = count > expected, corrected <= LEVEL
     # In large data many p-values are 0; the deviance of a Poisson count orders them still.
     deviance = xlogy(count, count / expected) - (count - expected)
     chosen = np.lexsort((-deviance, p_value, np.where(clear, ~over, 2)))[:top]
-    spelled = _spelled([tested.actions for tested in found], chosen)
+    spelled = _spell([tested.actions for tested in by_length], chosen)
     shown = (values[chosen].tolist() for values in (count, expected, count / expected, low, high, p_value, corrected))
     return [Motif(*values) for values in zip(spelled, *shown, strict=True)]
 
 
-def _spelled(actions: list[Tensor], chosen: np.ndarray[tuple[int], np.dtype[np.int64]]) -> list[tuple[int, ...]]:
+def _spell(actions: list[Tensor], chosen: np.ndarray[tuple[int], np.dtype[np.int64]]) -> list[tuple[int, ...]]:
     """The actions of those `chosen` among all that are in the parts of `actions`, each part `[K, n]` of one length."""
     first, out = 0, dict[int, tuple[int, ...]]()
-    for part in actions:
-        here = chosen[(chosen >= first) & (chosen < first + len(part))]
-        rows = part.cpu()[torch.from_numpy(here - first)].tolist()
-        out.update(zip(here.tolist(), map(tuple, rows), strict=True))
-        first += len(part)
+    for batch in actions:
+        places = chosen[(chosen >= first) & (chosen < first + len(batch))]
+        rows = batch.cpu()[torch.from_numpy(places - first)].tolist()
+        out.update(zip(places.tolist(), map(tuple, rows), strict=True))
+        first += len(batch)
     return [out[i] for i in chosen.tolist()]
 
 

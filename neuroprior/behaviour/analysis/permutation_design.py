@@ -159,7 +159,7 @@ class PermutationDesign:
     @property
     def possible(self) -> int:
         """The number of labellings, of ways to give the blocks their conditions."""
-        ways: int = prod(factorial(sum(own)) // prod(map(factorial, own)) for own in self.cell_sizes.tolist())
+        ways: int = prod(factorial(sum(sizes)) // prod(map(factorial, sizes)) for sizes in self.cell_sizes.tolist())
         return ways
 
     @property
@@ -177,28 +177,28 @@ class PermutationDesign:
         As the observed labelling is among them, the p-value of a statistic is the share of labellings that reach it.
         """
         if self.possible <= drawn + 1:
-            found = self._every()
+            labellings = self._every()
         else:
             draws, size = generator_on(generator, "cpu"), max(DRAWN_AT_ONCE // len(self.label), 1)
             parts = [self._random(min(size, drawn - at), draws) for at in range(0, drawn, size)]
-            found = torch.cat([self.label[None].short(), *parts])
-        return found.T.contiguous()
+            labellings = torch.cat([self.label[None].short(), *parts])
+        return labellings.T.contiguous()
 
     def _random(self, number: int, generator: torch.Generator) -> Tensor:
         return self.label.short()[shuffle_within(self.cell, number, generator)]
 
     def _every(self) -> Tensor:
         sizes, order = self.cell_sizes, self.cell.argsort(stable=True)
-        found, left, last = torch.zeros(1, 0, dtype=torch.int16), sizes[:1], 0
+        labellings, left, last = torch.zeros(1, 0, dtype=torch.int16), sizes[:1], 0
         for cell in self.cell[order].tolist():  # each step gives one block more each of the conditions that are left
             if cell != last:
-                left, last = sizes[cell].expand(len(found), -1), cell
+                left, last = sizes[cell].expand(len(labellings), -1), cell
             row, label = (left > 0).nonzero().unbind(1)
-            found = torch.cat([found[row], label[:, None].short()], 1)
+            labellings = torch.cat([labellings[row], label[:, None].short()], 1)
             left = left[row] - torch.nn.functional.one_hot(label, sizes.shape[1])
-        found = found[:, order.argsort()]
-        observed = int((found == self.label).all(1).nonzero()[0, 0])
-        return found.roll(-observed, 0)
+        labellings = labellings[:, order.argsort()]
+        observed = int((labellings == self.label).all(1).nonzero()[0, 0])
+        return labellings.roll(-observed, 0)
 
 
 def shuffle_within(cell: Tensor, number: int, generator: torch.Generator) -> Tensor:

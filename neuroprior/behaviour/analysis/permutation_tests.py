@@ -44,8 +44,8 @@ def largest_statistics(
     """
     observed = statistics(permutations[:, :1])
     parts, reached = [], torch.zeros(features, dtype=torch.double)
-    for part in permutations.split(max(NUMBERS_AT_ONCE // features, 1), 1):
-        values = statistics(part)
+    for batch in permutations.split(max(NUMBERS_AT_ONCE // features, 1), 1):
+        values = statistics(batch)
         parts.append(values.amax(0))
         reached += (values >= _least(observed)).sum(1)
     largest = torch.cat(parts)

@@ -159,8 +159,8 @@ def _count_in_time(recordings: Recordings, by_subject: bool, per: str) -> _Count
     np.add.at(exposure, watched["session"], overlap(place(watched, "start"), place(watched, "stop"), edges))
     behaviour, names = pd.factorize(events["behaviour"], sort=True)
     bouts = np.zeros((len(whole), len(names), BINS))
-    part = (place(events, "start") * BINS).astype(np.int64).clip(0, BINS - 1)
-    np.add.at(bouts, (events["session"], behaviour, part), 1)
+    time_bin = (place(events, "start") * BINS).astype(np.int64).clip(0, BINS - 1)
+    np.add.at(bouts, (events["session"], behaviour, time_bin), 1)
     unit = pd.factorize(whole["subject"])[0] if by_subject else np.arange(len(whole))
     return _Counts([str(name) for name in names], bouts, exposure if per == "time" else bouts.sum(1), unit)
 
@@ -172,9 +172,9 @@ def _count_in_order(plans: Plans) -> tuple[_Counts, str]:
     plans = join_fragments(plans)[0]
     mask, unit = plans.mask(), unit_name(plans)
     plan, step = mask.nonzero().unbind(1)
-    part = ((step + 0.5) * BINS / mask.sum(1)[plan]).long()
+    step_bin = ((step + 0.5) * BINS / mask.sum(1)[plan]).long()
     bouts = np.zeros((len(plans), plans.num_actions, BINS))
-    np.add.at(bouts, tuple(index.cpu().numpy() for index in (plan, plans.actions[mask].long(), part)), 1)
+    np.add.at(bouts, tuple(index.cpu().numpy() for index in (plan, plans.actions[mask].long(), step_bin)), 1)
     acted = mask.any(1).cpu().numpy()
     alone = unit == "parts of the sequence"
     of_plan = np.zeros(len(plans)) if alone else units(plans, mask)[:, :1].flatten().cpu().numpy()

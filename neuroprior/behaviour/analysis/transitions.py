@@ -187,19 +187,19 @@ def transitions(
     cell, plan = flat.actions[at] * size + flat.actions[at + 1], flat.plan[at]
     group_counts = (group[plan] * size**2 + cell).bincount(minlength=len(groups) * size**2).view(-1, size, size)
     cells = torch.full((len(groups), size**2), float("nan"), dtype=torch.double, device=cell.device)
-    made, p_value = 0, float("nan")
+    drawn, p_value = 0, float("nan")
     table, units = _Table.of(group_counts), unit.to(cell.device)[plan]
     under = torch.stack([units, group[plan]]).unique(dim=1)  # the groups that each unit is in
     test: Test = "none" if len(under[0].unique()) < under.shape[1] else _which_test(table, under[1].bincount())
     if test == "permutation":
         taken = _PlanCounts.of(units, cell, group[plan], table)
-        made = min(permutations, max(MAX_WORK // _cost(table, taken), FEWEST_PERMUTATIONS))
-        p_value, found = _permutation_test(table, taken, made, generator_on(generator, cell.device))
-        cells[table.present[:, None], table.cell] = found
+        drawn = min(permutations, max(MAX_WORK // _cost(table, taken), FEWEST_PERMUTATIONS))
+        p_value, corrected = _permutation_test(table, taken, drawn, generator_on(generator, cell.device))
+        cells[table.present[:, None], table.cell] = corrected
     statistic = float("nan") if test == "none" else float(table.overall(table.observed))
     subjects = subject.to(cell.device)[plan]
     whole = _interval(cell, subjects if len(subjects.unique()) > 1 else plan, size)
-    each = [_interval(cell[own], units[own], size) for own in (group[plan] == g for g in range(len(groups)))]
+    each = [_interval(cell[inside], units[inside], size) for inside in (group[plan] == g for g in range(len(groups)))]
     low, high = (torch.stack(ends) for ends in zip(whole, *each, strict=True))
     return Transitions(
         group_counts.sum(0),
@@ -209,7 +209,7 @@ def transitions(
         p_value,
         cells.view(-1, size, size),
         test,
-        made,
+        drawn,
         low,
         high,
         action_names(plans),
@@ -285,10 +285,10 @@ class _Table(NamedTuple):
         pooled, in_rows = self.observed.sum(0), self.in_rows(counts)
         every = self.in_rows(pooled)
         ours = in_rows[..., self.row]
-        found = _n_log_n(counts) + _n_log_n(ours - counts) + _n_log_n(pooled - counts)
-        found += _n_log_n(every[self.row] - pooled - ours + counts)
-        found -= (_n_log_n(in_rows) + _n_log_n(every - in_rows))[..., self.row]
-        return 2 * (found + _n_log_n(every)[self.row] - _n_log_n(pooled) - _n_log_n(every[self.row] - pooled))
+        half = _n_log_n(counts) + _n_log_n(ours - counts) + _n_log_n(pooled - counts)
+        half += _n_log_n(every[self.row] - pooled - ours + counts)
+        half -= (_n_log_n(in_rows) + _n_log_n(every - in_rows))[..., self.row]
+        return 2 * (half + _n_log_n(every)[self.row] - _n_log_n(pooled) - _n_log_n(every[self.row] - pooled))
 
     def tie(self) -> float:
         return ROUNDING * float(_n_log_n(self.observed.sum()))
@@ -346,8 +346,8 @@ def _permutation_test(
     together = max(NUMBERS_AT_ONCE // _cost(table, taken), 1)
     num, device = len(taken.label), taken.label.device
     for at in range(0, permutations, together):
-        part = range(at, min(at + together, permutations))
-        orders = [torch.randperm(num, generator=generator, device=device) for _ in part]
+        batch = range(at, min(at + together, permutations))
+        orders = [torch.randperm(num, generator=generator, device=device) for _ in batch]
         counts = taken.regroup(taken.label[torch.stack(orders)], table)
         reached += int((table.overall(counts) >= observed - tie).sum())
         greatest.append(table.cells(counts).amax((1, 2)))

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.distance import pdist, squareform
 
 from neuroprior.behaviour import RecordedPlans, individual_types, individuals
-from neuroprior.behaviour.analysis.individuals import _distance, _scaled
+from neuroprior.behaviour.analysis.individuals import _distance, _scale
 from tests.support.chains import markov_plans, markov_probs
 from tests.support.sources import refuses, seeded
 
@@ -31,7 +31,7 @@ def test_the_distance_is_that_of_jensen_and_shannon():
 def test_places_keep_the_distances_of_points_in_a_plane():
     points = np.random.default_rng(0).normal(size=(7, 2))
     distances = squareform(pdist(points))
-    assert squareform(pdist(_scaled(distances))) == pytest.approx(distances)
+    assert squareform(pdist(_scale(distances))) == pytest.approx(distances)
 
 
 def test_the_odd_one_out_is_farthest_and_beyond_chance():
