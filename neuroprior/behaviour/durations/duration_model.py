@@ -122,12 +122,12 @@ class DurationModel(SavedModule):
             *((a, None) for a in range(self.num_actions)),
             *(divmod(p, self.num_actions) for p in self.pair.tolist()),
         ]
-        found = []
+        rows = []
         for row, (action, after) in enumerate(keys):
             name = LAW_NAMES[int(self.law[row])]
             values = dict(zip(LAWS[name].names, self.values[row].tolist(), strict=False))
-            found.append(DurationLaw(action, after, name, values, float(self.zero[row]), int(self.number[row])))
-        return found
+            rows.append(DurationLaw(action, after, name, values, float(self.zero[row]), int(self.number[row])))
+        return rows
 
     @torch.no_grad()
     def fit(self, plans: RecordedPlans) -> Self:
@@ -140,31 +140,31 @@ class DurationModel(SavedModule):
             ValueError: plans of other actions, without durations, or of which none is known.
         """
         self._check(plans)
-        known = self._known(plans)
-        if not bool(known.any()):
+        timed = self._timed_mask(plans)
+        if not bool(timed.any()):
             raise ValueError("`durations` must have one at least that is known, and not NaN.")
-        action, after = plans.actions[known].long().cpu(), self._next(plans)[known].cpu()
-        time, fold = durations_of(plans)[known].double().cpu(), _parts(plans, known)[known].cpu()
+        action, after = plans.actions[timed].long().cpu(), self._next(plans)[timed].cpu()
+        time, fold = durations_of(plans)[timed].double().cpu(), _fold_numbers(plans, timed)[timed].cpu()
         zeros = time == 0
         count = action.bincount(minlength=self.num_actions)
         pooled = zeros.double().mean()
         zero = action[zeros].bincount(minlength=self.num_actions) / count.double()
         zero = torch.where(count < FEWEST, pooled, zero)
         action, after, time, fold = action[~zeros], after[~zeros], time[~zeros], fold[~zeros]
-        held = _Held(action, after, time, fold.unique(return_inverse=True)[1], _cut_off(plans)[known].cpu()[~zeros])
-        chosen, fits, number = self._of_actions(held)
+        held = _Held(action, after, time, fold.unique(return_inverse=True)[1], _cut_off(plans)[timed].cpu()[~zeros])
+        chosen, fits, number = self._action_laws(held)
         law = torch.tensor([LAW_NAMES.index(name) for name in self.laws])
-        own = fits[chosen, -1, torch.arange(self.num_actions)]
-        tables = [law[chosen], zero, own, number.masked_fill(number < FEWEST, 0)]
+        action_parameters = fits[chosen, -1, torch.arange(self.num_actions)]
+        tables = [law[chosen], zero, action_parameters, number.masked_fill(number < FEWEST, 0)]
         pair = after[:0]
         if self.transitions and len(time):
-            pair, of_transitions, parameters, number = self._of_transitions(held, chosen, fits)
+            pair, of_transitions, parameters, number = self._transition_laws(held, chosen, fits)
             more = [law[of_transitions], zero[pair // self.num_actions], parameters, number]
             tables = [torch.cat(both) for both in zip(tables, more, strict=True)]
         self._keep(*(table.to(self.law.device) for table in (pair, *tables)))
         return self
 
-    def _of_actions(self, held: "_Held") -> tuple[Tensor, Tensor, Tensor]:
+    def _action_laws(self, held: "_Held") -> tuple[Tensor, Tensor, Tensor]:
         """Laws of actions.
 
         Returns:
@@ -178,19 +178,19 @@ class DurationModel(SavedModule):
             return torch.zeros(size, dtype=torch.long), ones, number
         # Last, all actions together, which stand for those with too few.
         cell = torch.cat([held.action, torch.full_like(held.action, size)])
-        time, part, cut_off = held.time.repeat(2), held.part.repeat(2), held.cut_off.repeat(2)
-        fits, count = _fits_without_parts(time, cut_off, cell, size + 1, part, self.laws)
+        time, fold, cut_off = held.time.repeat(2), held.fold.repeat(2), held.cut_off.repeat(2)
+        fits, count = _fit_without_folds(time, cut_off, cell, size + 1, fold, self.laws)
         few = count < FEWEST
         few[:, size] = False
         fits = torch.where(few[..., None], fits[:, :, size:], fits)
         score = torch.zeros(laws, size + 1, dtype=torch.double)
         if len(count) > 2:
             for place, name in enumerate(self.laws):
-                score[place].index_add_(0, cell, log_likelihood(LAWS[name], time, cut_off, fits[place, part, cell]))
+                score[place].index_add_(0, cell, log_likelihood(LAWS[name], time, cut_off, fits[place, fold, cell]))
         chosen = (score - self._prices()[:, None]).argmax(0)
         return torch.where(number < FEWEST, chosen[size], chosen[:size]), fits[:, :, :size], number
 
-    def _of_transitions(
+    def _transition_laws(
         self, held: "_Held", law_of: Tensor, of_actions: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The laws of transitions, of those actions that they predict better: pairs, places, parameters and numbers."""
@@ -198,19 +198,19 @@ class DurationModel(SavedModule):
         code = held.action * size + held.after
         pair, count = code[(held.after >= 0) & ~held.cut_off].unique(return_counts=True)
         pair = pair[count >= FEWEST_OF_TRANSITION]
-        own = (held.after >= 0) & torch.isin(code, pair)
-        action, time, part, cut_off = held.action[own], held.time[own], held.part[own], held.cut_off[own]
-        cell, doing = torch.searchsorted(pair, code[own]), pair // size
+        kept = (held.after >= 0) & torch.isin(code, pair)
+        action, time, fold, cut_off = held.action[kept], held.time[kept], held.fold[kept], held.cut_off[kept]
+        cell, doing = torch.searchsorted(pair, code[kept]), pair // size
         # The law of the action comes last.
         score = torch.zeros(laws + 1, size, dtype=torch.double)
-        if not len(part) or bool((part == part[0]).all()):
+        if not len(fold) or bool((fold == fold[0]).all()):
             return pair[:0], pair[:0], score.new_zeros(0, MOST_PARAMETERS), pair[:0]
-        fits, count = _fits_without_parts(time, cut_off, cell, len(pair), part, self.laws, of_actions.shape[1] - 1)
+        fits, count = _fit_without_folds(time, cut_off, cell, len(pair), fold, self.laws, of_actions.shape[1] - 1)
         fits = torch.where((count < FEWEST)[..., None], of_actions[:, :, doing], fits)
         for place, name in enumerate(self.laws):
-            score[place].index_add_(0, action, log_likelihood(LAWS[name], time, cut_off, fits[place, part, cell]))
+            score[place].index_add_(0, action, log_likelihood(LAWS[name], time, cut_off, fits[place, fold, cell]))
             same = law_of[action] == place
-            parameters = of_actions[place, part[same], action[same]]
+            parameters = of_actions[place, fold[same], action[same]]
             likely = log_likelihood(LAWS[name], time[same], cut_off[same], parameters)
             score[laws].index_add_(0, action[same], likely)
         # The law of the action is needed in either case: for rare transitions, and at the end of a plan.
@@ -240,16 +240,18 @@ class DurationModel(SavedModule):
             ValueError: plans of other actions, or without durations.
         """
         self._check(plans)
-        known, row = self._known(plans), self._rows(plans)
-        time, row = durations_of(plans).double()[known], row[known]
-        some = time > 0
-        density = by_law("log_density", self.law[row[some]], time[some], self.values[row[some]])
-        longer = _cut_off(plans)[known][some]
-        above = by_law("cdf", self.law[row[some]][longer], time[some][longer], self.values[row[some]][longer])
+        timed, row = self._timed_mask(plans), self._rows(plans)
+        time, row = durations_of(plans).double()[timed], row[timed]
+        positive = time > 0
+        density = by_law("log_density", self.law[row[positive]], time[positive], self.values[row[positive]])
+        longer = _cut_off(plans)[timed][positive]
+        above = by_law(
+            "cdf", self.law[row[positive]][longer], time[positive][longer], self.values[row[positive]][longer]
+        )
         density[longer] = log_survival(above)
-        found = self.zero[row].log()
-        found[some] = torch.log1p(-self.zero[row[some]]) + density
-        return torch.zeros(known.shape, dtype=torch.double, device=known.device).masked_scatter(known, found)
+        log_probs = self.zero[row].log()
+        log_probs[positive] = torch.log1p(-self.zero[row[positive]]) + density
+        return torch.zeros(timed.shape, dtype=torch.double, device=timed.device).masked_scatter(timed, log_probs)
 
     def cdf(self, action: int, times: Tensor) -> Tensor:
         """The probability that an action takes at most so long, whatever follows it.
@@ -309,7 +311,7 @@ class DurationModel(SavedModule):
         after = plans.actions.long().masked_fill(~plans.mask(), -1)
         return functional.pad(after[:, 1:], (0, min(plans.max_length, 1)), value=-1)
 
-    def _known(self, plans: RecordedPlans) -> Tensor:
+    def _timed_mask(self, plans: RecordedPlans) -> Tensor:
         times = durations_of(plans)
         return plans.mask(end=False) & ~times.isnan() & ~(_cut_off(plans) & (times == 0))
 
@@ -338,7 +340,7 @@ class _Held(NamedTuple):
     action: Tensor
     after: Tensor  # the next action; -1: there is none
     time: Tensor
-    part: Tensor
+    fold: Tensor
     cut_off: Tensor
 
 
@@ -347,35 +349,35 @@ def _cut_off(plans: RecordedPlans) -> Tensor:
     return torch.zeros_like(plans.mask()) if plans.cut_off is None else plans.cut_off
 
 
-def _fits_without_parts(
+def _fit_without_folds(
     time: Tensor,
     cut_off: Tensor,
     cell: Tensor,
     cells: int,
-    part: Tensor,
+    fold: Tensor,
     laws: Sequence[LawName],
-    parts: int | None = None,
+    num_folds: int | None = None,
 ) -> tuple[Tensor, Tensor]:
     """K laws `[K, F + 1, C, ...]` fitted to each cell without each of F parts, and last to all; and of how many."""
-    parts = int(part.max()) + 1 if parts is None else parts
-    step, found = resolution(time), []
-    for some in torch.arange(parts + 1).split(max(AT_ONCE // max(len(time), 1), 1)):
-        without, index = (part != some[:, None]).nonzero(as_tuple=True)
-        sets = Sets(time[index].log(), without * cells + cell[index], len(some) * cells, step, cut_off[index])
+    num_folds = int(fold.max()) + 1 if num_folds is None else num_folds
+    step, batches = resolution(time), []
+    for left_out in torch.arange(num_folds + 1).split(max(AT_ONCE // max(len(time), 1), 1)):
+        without, index = (fold != left_out[:, None]).nonzero(as_tuple=True)
+        sets = Sets(time[index].log(), without * cells + cell[index], len(left_out) * cells, step, cut_off[index])
         count = sets.cell[~sets.cut_off].bincount(minlength=sets.number).view(-1, cells)
-        found.append((fit_laws(sets, laws).unflatten(1, (len(some), cells)), count))
-    fits, counts = zip(*found, strict=True)
+        batches.append((fit_laws(sets, laws).unflatten(1, (len(left_out), cells)), count))
+    fits, counts = zip(*batches, strict=True)
     return torch.cat(fits, 1), torch.cat(counts)
 
 
-def _parts(plans: Plans, known: Tensor) -> Tensor:
+def _fold_numbers(plans: Plans, timed: Tensor) -> Tensor:
     """`[N, L]`: the part of the plans that each duration is held out with."""
     plans = divisible(plans)
     units = num_units(plans)
-    part = torch.zeros(plans.actions.shape, dtype=torch.long, device=known.device)
+    fold = torch.zeros(plans.actions.shape, dtype=torch.long, device=timed.device)
     if units < FEWEST_UNITS:
-        place = known.flatten().cumsum(0).view(known.shape) - 1
-        return (place * FOLDS).div(max(int(known.sum()), 1), rounding_mode="floor")
+        place = timed.flatten().cumsum(0).view(timed.shape) - 1
+        return (place * FOLDS).div(max(int(timed.sum()), 1), rounding_mode="floor")
     for number, (_, held_out) in enumerate(folds(plans, min(FOLDS, units))):
-        part[held_out] = number
-    return part
+        fold[held_out] = number
+    return fold

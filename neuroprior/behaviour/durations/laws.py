@@ -202,11 +202,11 @@ def _two_lognormal(sets: Sets) -> Tensor:
     """Expectation maximisation on standardised logarithms, from two halves around their mean."""
     center, spread = sets.center()
     value = (sets.log - center[sets.cell]) / spread[sets.cell]
-    ended = _condensed(value[~sets.cut_off], sets.cell[~sets.cut_off], sets.number)
-    longer = _condensed(value[sets.cut_off], sets.cell[sets.cut_off], sets.number)
+    ended = _condense(value[~sets.cut_off], sets.cell[~sets.cut_off], sets.number)
+    longer = _condense(value[sets.cut_off], sets.cell[sets.cut_off], sets.number)
     at_once = max(AT_ONCE // max(ended[0].shape[1] + longer[0].shape[1], 1), 1)
     parts = zip(*(each.split(at_once) for each in (*ended, *longer, center, spread)), strict=True)
-    return torch.cat([_two_normal(sets, *part) for part in parts])
+    return torch.cat([_two_normal(sets, *batch) for batch in parts])
 
 
 def _two_normal(
@@ -240,7 +240,7 @@ def _two_normal(
     return torch.stack([share[:, 0] / share.sum(-1), means[:, 0], spreads[:, 0], means[:, 1], spreads[:, 1]], -1)
 
 
-def _condensed(values: Tensor, cell: Tensor, sets: int) -> tuple[Tensor, Tensor]:
+def _condense(values: Tensor, cell: Tensor, sets: int) -> tuple[Tensor, Tensor]:
     """At most `MOST_VALUES` means `[C, M]` of neighbours in each set, and how many values each is of; 0: of none."""
     order = values.argsort()
     order = order[cell[order].argsort(stable=True)]
@@ -292,8 +292,8 @@ def _two_quantile(number: Tensor, of: Tensor) -> Tensor:
 def _gamma_quantile(number: Tensor, of: Tensor) -> Tensor:
     from scipy import special
 
-    found = special.gammaincinv(of[..., 0].cpu().numpy(), number.cpu().numpy())
-    return torch.as_tensor(found, device=number.device) * of[..., 1]
+    quantiles = special.gammaincinv(of[..., 0].cpu().numpy(), number.cpu().numpy())
+    return torch.as_tensor(quantiles, device=number.device) * of[..., 1]
 
 
 LAWS: dict[LawName, Law] = {
@@ -339,7 +339,7 @@ LAWS: dict[LawName, Law] = {
 def fit_laws(sets: Sets, laws: Sequence[LawName]) -> Tensor:
     """`[K, C, MOST_PARAMETERS]`: the parameters of K laws, by name, in each set; those of an empty set are NaN."""
     fits = [LAWS[law].fit(sets) for law in laws]
-    return torch.stack([functional.pad(own, (0, MOST_PARAMETERS - own.shape[-1])) for own in fits])
+    return torch.stack([functional.pad(parameters, (0, MOST_PARAMETERS - parameters.shape[-1])) for parameters in fits])
 
 
 def log_likelihood(law: Law, time: Tensor, cut_off: Tensor, parameters: Tensor) -> Tensor:
@@ -357,8 +357,8 @@ def log_survival(cdf: Tensor) -> Tensor:
 def by_law(what: Literal["log_density", "cdf", "quantile"], law: Tensor, values: Tensor, parameters: Tensor) -> Tensor:
     """A function of laws, each value `[n]` under its own `law [n]`, a number in `LAWS`, and `parameters [n, ...]`."""
     out = torch.empty_like(values)
-    for number, known in enumerate(LAWS.values()):
-        here = law == number
-        if bool(here.any()):
-            out[here] = getattr(known, what)(values[here], parameters[here])
+    for number, functions in enumerate(LAWS.values()):
+        chosen = law == number
+        if bool(chosen.any()):
+            out[chosen] = getattr(functions, what)(values[chosen], parameters[chosen])
     return out

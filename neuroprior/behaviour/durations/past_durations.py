@@ -105,8 +105,8 @@ class PastDurations:
         Raises:
             ValueError: the plans have no durations, or a context index.
         """
-        own = plans.context
-        if own is not None and not own.is_floating_point():
+        context = plans.context
+        if context is not None and not context.is_floating_point():
             raise ValueError(
                 "context: an index cannot stand beside past durations, which are features; write it as numbers with a"
                 " decimal point, one for each context, or leave it out"
@@ -119,6 +119,6 @@ class PastDurations:
         parts = [
             before[:, self.number - lag : self.number - lag + plans.max_length] for lag in range(1, self.number + 1)
         ]
-        if own is not None:
-            parts.insert(0, own.float())
+        if context is not None:
+            parts.insert(0, context.float())
         return replace(plans, context=torch.cat(parts, -1), context_names=None)

@@ -72,8 +72,8 @@ class SemiMarkovPrior(Prior):
 
     @property
     def config(self) -> dict[str, Any]:
-        own = {"laws": list(self.durations.laws), "transitions": self.durations.transitions}
-        return {"num_actions": self.num_actions, "actions": described(self.actions)} | own
+        duration_config = {"laws": list(self.durations.laws), "transitions": self.durations.transitions}
+        return {"num_actions": self.num_actions, "actions": described(self.actions)} | duration_config
 
     @property
     def learned(self) -> dict[str, Any]:

@@ -117,13 +117,13 @@ def duration_survival(
         1.0
     """
     times = durations_of(plans)
-    known = times > 0  # 0 beyond the end of a plan
-    if not bool(known.any()):
+    timed = times > 0  # 0 beyond the end of a plan
+    if not bool(timed.any()):
         raise ValueError("`plans` must have durations above 0, got none")
-    time = times[known].double().cpu().numpy()
-    ended = np.ones(len(time), bool) if plans.cut_off is None else ~plans.cut_off[known].cpu().numpy()
-    action = plans.actions[known].long().cpu().numpy()
-    unit, plan = units(plans, known)[known].cpu().numpy(), known.nonzero()[:, 0].cpu().numpy()
+    time = times[timed].double().cpu().numpy()
+    ended = np.ones(len(time), bool) if plans.cut_off is None else ~plans.cut_off[timed].cpu().numpy()
+    action = plans.actions[timed].long().cpu().numpy()
+    unit, plan = units(plans, timed)[timed].cpu().numpy(), timed.nonzero()[:, 0].cpu().numpy()
     levels, level = [""], np.zeros(len(time), np.int64)
     if plans.condition is not None:
         level = plans.condition.cpu().numpy()[plan]
@@ -131,8 +131,8 @@ def duration_survival(
     names, curves = action_names(plans), dict[tuple[str, str], Curve]()
     for number in np.flatnonzero(np.bincount(action[ended], minlength=len(names))):
         for place in np.unique(level[(action == number) & ended]):
-            own = (action == number) & (level == place)
-            curves[names[number], levels[place]] = survival_curve(time[own], ended[own], unit[own])
+            inside = (action == number) & (level == place)
+            curves[names[number], levels[place]] = survival_curve(time[inside], ended[inside], unit[inside])
     if plans.condition is None:
         return DurationSurvival(curves, {}, {}, None)
     design = PermutationDesign.of(plans)
@@ -142,11 +142,11 @@ def duration_survival(
     block = design.block.numpy()[plan]
     statistics, ratios = {}, dict[str, Interval]()
     for number in np.flatnonzero(np.bincount(action[ended & (block >= 0)], minlength=len(names))):
-        own = (action == number) & (block >= 0)
-        ends, expected = _count_ends(time[own], ended[own], block[own], design.cell.numpy())
+        inside = (action == number) & (block >= 0)
+        ends, expected = _count_ends(time[inside], ended[inside], block[inside], design.cell.numpy())
         statistics[names[number]] = _log_rank(ends, expected, labels, len(design.conditions))
-        if len(np.unique(level)) == 2 == len(np.unique(level[own & ended])):
-            ratios[names[number]] = _ratio_of_means(time[own], ended[own], block[own], design)
+        if len(np.unique(level)) == 2 == len(np.unique(level[inside & ended])):
+            ratios[names[number]] = _ratio_of_means(time[inside], ended[inside], block[inside], design)
     return DurationSurvival(curves, combine_tests(statistics)[0], ratios, design)
 
 
@@ -191,10 +191,10 @@ def _count_ends(time: Array, ended: NDArray[np.bool_], block: Numbers, cell: Num
     """Return how many bouts of each block `[B]` ended, and how many were expected to by the hazard of its cell."""
     expected = np.zeros(len(time))
     for number in np.unique(cell[block]):
-        own = cell[block] == number
-        place = np.unique(time[own], return_inverse=True)[1]
+        in_cell = cell[block] == number
+        place = np.unique(time[in_cell], return_inverse=True)[1]
         at_risk = np.bincount(place)[::-1].cumsum()[::-1]
-        expected[own] = (np.bincount(place, ended[own]) / at_risk).cumsum()[place]
+        expected[in_cell] = (np.bincount(place, ended[in_cell]) / at_risk).cumsum()[place]
     ends, due = (np.asarray(np.bincount(block, one, len(cell)), np.float64) for one in (ended, expected))
     return ends, due
 
@@ -215,13 +215,13 @@ def _ratio_of_means(time: Array, ended: NDArray[np.bool_], block: Numbers, desig
     units, under = len(design.units), label[block]
     # Up to the end, unless the longest bout of a condition was cut off: beyond it nothing is known of this condition.
     last = [time[under == condition].max() for condition in (0, 1)]
-    known = [ended[(under == condition) & (time == last[condition])].all() for condition in (0, 1)]
-    limit = min((longest for longest, whole in zip(last, known, strict=True) if not whole), default=max(last))
+    last_ended = [ended[(under == condition) & (time == last[condition])].all() for condition in (0, 1)]
+    limit = min((longest for longest, whole in zip(last, last_ended, strict=True) if not whole), default=max(last))
     kept = np.arange(units) != np.arange(-1, units)[:, None]  # [G + 1, G]: all, then without each unit
     logs = []
     for condition in (0, 1):
-        own, blocks = under == condition, np.flatnonzero(label == condition)
-        at, ends, at_risk = _count_by_unit(time[own], ended[own], unit[block[own]], units)
+        inside, blocks = under == condition, np.flatnonzero(label == condition)
+        at, ends, at_risk = _count_by_unit(time[inside], ended[inside], unit[block[inside]], units)
         remaining = kept[:, unit[blocks]].astype(np.float64)
         number = remaining @ (cell[blocks][:, None] == cell[blocks])
         weight = np.zeros(kept.shape)
