@@ -107,9 +107,9 @@ class Recordings:
         if self.spans is None:
             end = stop.groupby(self.fragment).transform("max")
         else:
-            known = start.notna()
+            timed = start.notna()
             spans = self.spans.rename(columns={"stop": "end"}).sort_values("start")
-            bouts = self.events.loc[known, [*KEYS, "start"]].reset_index(names="row").sort_values("start")
+            bouts = self.events.loc[timed, [*KEYS, "start"]].reset_index(names="row").sort_values("start")
             merged = pd.merge_asof(bouts, spans[[*KEYS, "start", "end"]], on="start", by=KEYS)
             end = pd.Series(merged["end"].to_numpy(), index=merged["row"]).reindex(self.events.index)
         return ((stop >= end) & (stop > start)).to_numpy(bool)
@@ -209,8 +209,8 @@ class Recordings:
         for level in sorted(pd.unique(self.events[factor])):
             inside = (self.events[factor] == level).to_numpy()
             pairs = self.events[inside][KEYS].drop_duplicates()
-            part = self._replace_events(self.events[inside], self.fragment[inside])
-            yield str(level), replace(part, spans=self.watched.merge(pairs, on=KEYS))
+            level_recordings = self._replace_events(self.events[inside], self.fragment[inside])
+            yield str(level), replace(level_recordings, spans=self.watched.merge(pairs, on=KEYS))
 
     def time_budget(self) -> pd.DataFrame:
         """Return the share of the watched time that each behaviour takes: rows are subjects, columns behaviours."""

@@ -177,8 +177,8 @@ def large_study(seed: int, *, effect: bool = True) -> Any:
 def _rank_by_sex(order: NDArray[Any], female: NDArray[Any]) -> NDArray[Any]:
     """Numbers from 0, in this order of the animals, that rise through both sexes in turn."""
     ranks = np.empty_like(order)
-    for first, own in enumerate((female, ~female)):
-        ranks[own] = 2 * order[own].argsort().argsort() + first
+    for first, of_sex in enumerate((female, ~female)):
+        ranks[of_sex] = 2 * order[of_sex].argsort().argsort() + first
     return ranks
 
 

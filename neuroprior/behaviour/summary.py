@@ -48,12 +48,12 @@ def describe(recordings: Any) -> Iterator[str | Table]:
     yield _table("Behaviours", recordings.behaviours(), all_rows=True)
     for factor in recordings.factors:
         counts = events.drop_duplicates(KEYS).groupby(["subject", factor]).size().unstack(fill_value=0)
-        yield _table(f"Recordings by {factor}", _with_total(counts).reset_index())
+        yield _table(f"Recordings by {factor}", _add_total(counts).reset_index())
     first = events[events[KEYS].eq(events[KEYS].iloc[0]).all(axis=1)]
     yield _table("The first events", first.head(MAX_EVENTS))
 
 
-def _with_total(counts: pd.DataFrame) -> pd.DataFrame:
+def _add_total(counts: pd.DataFrame) -> pd.DataFrame:
     """Return a table of recordings with the number of subjects of each level as its last row."""
     total = (counts > 0).sum().to_frame("subjects").T
     return pd.concat([counts, total]).rename_axis("subject")

@@ -24,10 +24,10 @@ def rows_of_events(table: Table) -> Part:
     if start_times and stop_times and start_times.kind != stop_times.kind and np.isfinite(stop).any():
         table.problems.add(f"`stop` must be {start_times.kind}, as `start` is, got {stop_times.kind}", [0], table.place)
     if start_times and start_times.kind == CLOCKS:
-        start, stop = _past_midnight(table, start, stop)
+        start, stop = _count_past_midnight(table, start, stop)
     elif len(table.roles.at.get("stop", [])) > 1:  # the day of the start stands before the time of the stop
         stop = np.where(stop < start - DAY / 2, stop + DAY, stop)
-    start, stop = _with_durations(table, start, stop, duration_times)
+    start, stop = _fill_by_durations(table, start, stop, duration_times)
     wrong = np.flatnonzero(stop < start - 1e-9)
     if wrong.size:
         what = f"the stop {stop[wrong[0]]:g} is before the start {start[wrong[0]]:g}"
@@ -48,9 +48,9 @@ def rows_of_events(table: Table) -> Part:
         table.first_notes.append(f"{twice.sum():,} rows repeat an earlier row, and are left out (first in {where})")
     rows = np.flatnonzero(~twice)
     stop = _make_exclusive(table, start, stop)
-    part = table.part(rows, labels[rows], start[rows], stop[rows])
-    part.notes += _notes_on_labels(table, labels, part, start_times is not None and bool(np.isnan(stop).all()))
-    return part
+    reading = table.part(rows, labels[rows], start[rows], stop[rows])
+    reading.notes += _notes_on_labels(table, labels, reading, start_times is not None and bool(np.isnan(stop).all()))
+    return reading
 
 
 def _repeated_rows(table: Table, start: Floats, stop: Floats) -> NDArray[np.bool_]:
@@ -61,7 +61,7 @@ def _repeated_rows(table: Table, start: Floats, stop: Floats) -> NDArray[np.bool
     return again & (stop > start)
 
 
-def _past_midnight(table: Table, start: Floats, stop: Floats) -> tuple[Floats, Floats]:
+def _count_past_midnight(table: Table, start: Floats, stop: Floats) -> tuple[Floats, Floats]:
     """Return starts and stops counted on over midnight."""
     of_day = start
     start = table.over_midnight(start)
@@ -73,7 +73,7 @@ def _past_midnight(table: Table, start: Floats, stop: Floats) -> tuple[Floats, F
     return start, stop
 
 
-def _with_durations(table: Table, start: Floats, stop: Floats, duration: Times | None) -> tuple[Floats, Floats]:
+def _fill_by_durations(table: Table, start: Floats, stop: Floats, duration: Times | None) -> tuple[Floats, Floats]:
     """Return starts and stops, filled by durations; durations that a user named count more than stops."""
     if duration is None:
         return start, stop
@@ -139,18 +139,18 @@ def _make_exclusive(table: Table, start: Floats, stop: Floats) -> Floats:
     return stop + step
 
 
-def _notes_on_labels(table: Table, labels: NDArray[Any], part: Part, only_starts: bool) -> list[str]:
+def _notes_on_labels(table: Table, labels: NDArray[Any], reading: Part, only_starts: bool) -> list[str]:
     """Return notes on rows without a label, on labels that repeat, and on starts without stops."""
     notes = []
     missing = labels == ""
     if missing.any():
         what = f"rows have no label (first in {table.place(int(missing.argmax()))})"
         notes.append(f"{missing.sum():,} of {len(labels):,} {what}: {table.after_missing}")
-    part.note_repeats("behaviours", " if a row is a frame,")
-    endless = part.events["stop"].isna().to_numpy() & part.events["start"].notna().to_numpy()
+    reading.note_repeats("behaviours", " if a row is a frame,")
+    endless = reading.events["stop"].isna().to_numpy() & reading.events["start"].notna().to_numpy()
     if 0 < endless.sum() < len(endless) and table.options.ends != "next":
-        where = table.place(int(part.rows[endless.argmax()]))
-        part.first_notes.append(
+        where = table.place(int(reading.rows[endless.argmax()]))
+        reading.first_notes.append(
             f"{endless.sum():,} of {len(endless):,} events have no stop (first in {where}): their durations are unknown"
             " (--ends next: until the next begins)"
         )

@@ -147,13 +147,13 @@ def find_roles(sheet: Sheet, columns: Columns, words: Mapping[str, str]) -> Role
     named, ranges, problems = _resolve(sheet, columns)
     if problems:
         raise ReadingError(problems)
-    plains = _by_plain_name(sheet.frame)
+    plains = _plain_names(sheet.frame)
     program = next((one for one in PROGRAMS if one.needs <= set(plains)), None) if sheet.header else None
     roles = Roles({use: names for use, names in named.items() if names}, program=program)
     _drop_empty(sheet, roles)
     _drop_index(sheet, roles)
     if not sheet.header and not named:
-        _find_roles_without_header(sheet, roles)
+        _guess_roles(sheet, roles)
         _check_direction(sheet, roles)
         return roles
     if program:
@@ -169,7 +169,7 @@ def find_roles(sheet: Sheet, columns: Columns, words: Mapping[str, str]) -> Role
     if "start" in roles.inferred and program is None:
         _add_dates(sheet, roles)
     _add_factors_above(sheet, roles, closed)
-    if {"plan", "action"} <= set(_by_plain_name(sheet.frame)) and not {"subject", "factors"} & closed:
+    if {"plan", "action"} <= set(_plain_names(sheet.frame)) and not {"subject", "factors"} & closed:
         _take_group_as_subject(sheet, roles)
     if "subject" in ranges:
         roles.at["behaviour"], roles.layout = roles.at.pop("subject"), "columns of subjects"
@@ -191,14 +191,14 @@ def find_roles(sheet: Sheet, columns: Columns, words: Mapping[str, str]) -> Role
     return roles
 
 
-def _by_plain_name(names: Iterable[str]) -> dict[str, str]:
+def _plain_names(names: Iterable[str]) -> dict[str, str]:
     """Return columns by their names as `plain` writes them; the first of two that are alike."""
     return {plain(name): name for name in reversed(list(names))}
 
 
 def _take_group_as_subject(sheet: Sheet, roles: Roles) -> None:
     """Read a column called group as the subject, where there is none: in tables of plans groups are independent."""
-    group = _by_plain_name(sheet.frame).get("group")
+    group = _plain_names(sheet.frame).get("group")
     if group and "subject" not in roles.at:
         roles.infer("subject", [group])
         roles.at["factors"] = [name for name in roles.at.get("factors", []) if name != group]
@@ -219,8 +219,8 @@ def _resolve(sheet: Sheet, columns: Columns) -> tuple[dict[str, list[str]], set[
             if exact is not None:
                 chosen.append(exact)
                 continue
-            ends = [_column(sheet, part) for part in name.split(":")]
-            parts = [_column(sheet, part) for part in name.split(",")]
+            ends = [_column(sheet, end) for end in name.split(":")]
+            parts = [_column(sheet, column) for column in name.split(",")]
             every = list(sheet.frame.columns)
             if len(ends) == 2 and None not in ends:
                 first, last = sorted((every.index(str(ends[0])), every.index(str(ends[1]))))
@@ -279,7 +279,7 @@ def _drop_index(sheet: Sheet, roles: Roles) -> None:
             sheet.frame = sheet.frame.drop(columns=name)
 
 
-def _find_roles_without_header(sheet: Sheet, roles: Roles) -> None:
+def _guess_roles(sheet: Sheet, roles: Roles) -> None:
     """Give roles to the columns of Audacity's labels (start, stop, label), of frames, or of a sequence a row."""
     frame = sheet.frame
     numeric = [bool(pd.to_numeric(frame[name].str.replace(",", "."), errors="coerce").notna().all()) for name in frame]
@@ -305,7 +305,7 @@ def _find_roles_without_header(sheet: Sheet, roles: Roles) -> None:
 
 def _find_use(sheet: Sheet, roles: Roles, use: str, words: Mapping[str, str]) -> None:
     """Give a use the column with its name; one that holds something else is left out with a note."""
-    plains = _by_plain_name(sheet.frame)
+    plains = _plain_names(sheet.frame)
     candidates = [plains[name] for name in NAMES[use] if name in plains and plains[name] not in roles.used()]
     if use == "event_type":
         kinds = {name: _event_words(sheet.frame[name], words) for name in candidates}
@@ -367,7 +367,7 @@ def _choose_recordings(sheet: Sheet, roles: Roles) -> None:
 
 def _add_dates(sheet: Sheet, roles: Roles) -> None:
     """Put a column of dates before times of day, so that days do not lie upon one another."""
-    plains = _by_plain_name(sheet.frame)
+    plains = _plain_names(sheet.frame)
     dates = [plains[name] for name in NAMES["date"] if name in plains and plains[name] not in roles.used()]
     start = sheet.frame[roles.at["start"][0]]
     words = pd.Series(pd.unique(start[start != ""])[:100], dtype=object)
@@ -421,7 +421,7 @@ def _choose_behaviour(sheet: Sheet, roles: Roles, is_range: bool, closed: set[st
                 roles.layout = "rows of sequences"
         return
     free = [name for name in frame if name not in roles.used()]
-    plains = _by_plain_name(free)
+    plains = _plain_names(free)
     usual = [plains[name] for name in NAMES["behaviour"] if name in plains]
     usual = [name for name in usual if not len(frame) or frame[name].ne("").any()]
     usual = [name for name in usual if not _is_measured(frame[name])]

@@ -104,7 +104,7 @@ def read_channels(table: Table, start: Floats, channels: Sequence[NDArray[Any]],
         first, last = first[kept], last[kept]
         bouts.append((order[first], label[first], when[first], after[last], stretch[first]))
     rows, names, starts, stops, stretches = (np.concatenate(columns) for columns in zip(*bouts, strict=True))
-    part = table.part(rows.astype(np.int64), names, starts, stops, stretches)
+    reading = table.part(rows.astype(np.int64), names, starts, stops, stretches)
     # What was watched begins with the first frame, not with the first behaviour.
     frames = pd.DataFrame({
         "recording": table.recording[order], "subject": table.subject[order], "stretch": stretch,
@@ -113,7 +113,7 @@ def read_channels(table: Table, start: Floats, channels: Sequence[NDArray[Any]],
     spans = frames.groupby("stretch", sort=False).agg(
         recording=("recording", "first"), subject=("subject", "first"), start=("start", "min"), stop=("stop", "max")
     )
-    return replace(part, spans=spans.reset_index(drop=True))
+    return replace(reading, spans=spans.reset_index(drop=True))
 
 
 def rows_of_frames(table: Table) -> Part:

@@ -90,8 +90,8 @@ def read_recordings(paths: Any, options: Options) -> Recordings:
     results = [_read_file(sheets, options) for sheets in groups]
     if problems := [problem for _, _, problems in results for problem in problems]:
         raise ReadingError(problems)
-    parts = [part for parts, _, _ in results for part in parts]
-    return _combine(parts, [note for _, notes, _ in results for note in notes], options)
+    readings = [reading for readings, _, _ in results for reading in readings]
+    return _combine(readings, [note for _, notes, _ in results for note in notes], options)
 
 
 def _tell_stems_apart(groups: list[list[Sheet]], files: list[Path]) -> None:
@@ -158,33 +158,33 @@ def _read_sheet(sheet: Sheet, options: Options) -> Part:
         return Part(sheet, roles, events, nothing, nothing, first_notes=[note], empty=[sheet.stem])
     if options.overlaps == "join" and roles.layout != "columns of behaviours":
         problems.add(f"`overlaps` must be error or keep in {roles.layout}, got 'join'", [0], table.place)
-    part = LAYOUTS[roles.layout](table)
-    _check_observers(table, part, problems)
-    _check_factors(part, problems)
+    reading = LAYOUTS[roles.layout](table)
+    _check_observers(table, reading, problems)
+    _check_factors(reading, problems)
     problems.stop()
     if roles.layout != "columns of behaviours":  # which has said so of its rows
-        _note_overlaps(table, part)
-    return part
+        _note_overlaps(table, reading)
+    return reading
 
 
-def _note_overlaps(table: Table, part: Part) -> None:
+def _note_overlaps(table: Table, reading: Part) -> None:
     """Note that bouts begin before those of other behaviours have ended."""
-    labelled = np.flatnonzero(part.events["behaviour"] != "")
-    late, number = _overlapping_rows(part.events.iloc[labelled], (*KEYS, "observer"))
+    labelled = np.flatnonzero(reading.events["behaviour"] != "")
+    late, number = _overlapping_rows(reading.events.iloc[labelled], (*KEYS, "observer"))
     if late.size:
-        where = table.place(int(part.rows[labelled[late.min()]]))
+        where = table.place(int(reading.rows[labelled[late.min()]]))
         what = f"{late.size:,} of {number:,} bouts begin before another one has ended (first in {where})"
-        part.first_notes.append(f"{what}: shares of time add up to more than 100 %")
+        reading.first_notes.append(f"{what}: shares of time add up to more than 100 %")
 
 
-def _check_observers(table: Table, part: Part, problems: Problems) -> None:
+def _check_observers(table: Table, reading: Part, problems: Problems) -> None:
     """Refuse events that two people scored, and overlapping bouts of one behaviour of one subject."""
     if "observer" in table.roles.at and "observer" in table.roles.inferred:
         pairs = pd.DataFrame({"recording": table.recording, "subject": table.subject, "observer": table.observer})
         several = pairs.groupby(KEYS, sort=False)["observer"].nunique()
         name = table.roles.at["observer"][0]
         del table.roles.at["observer"]
-        part.events = part.events.drop(columns="observer")
+        reading.events = reading.events.drop(columns="observer")
         if (several > 1).any():
             recording, subject = several.index[int(several.to_numpy().argmax())]
             row = int(np.flatnonzero((pairs["recording"] == recording) & (pairs["subject"] == subject))[0])
@@ -192,20 +192,20 @@ def _check_observers(table: Table, part: Part, problems: Problems) -> None:
             way = f"say --columns.observer {name!r} to keep them apart, or read the file of one"
             problems.add(f"{what}; {way}", [row], table.place)
             return
-    share, row = _overlap_share(part.events)
+    share, row = _overlap_share(reading.events)
     if share <= MAX_OVERLAP or table.options.overlaps == "keep":
         return
     way = "if two people scored, read the file of one; --overlaps keep reads them as they are"
-    if separating := _separating_column(table, part):
+    if separating := _separating_column(table, reading):
         use = f"--columns.observer {separating!r}, or --columns.subject {separating!r}"
         if plain(separating).startswith("modifier"):
-            use = f"--columns.behaviour '{','.join([*part.roles.at['behaviour'], separating])}'"
+            use = f"--columns.behaviour '{','.join([*reading.roles.at['behaviour'], separating])}'"
         elif plain(separating) in (*NAMES["recording"], *NAMES["factors"], *NAMES["date"]):
-            use = f"--columns.recording '{','.join([*part.roles.at.get('recording', []), separating])}'"
+            use = f"--columns.recording '{','.join([*reading.roles.at.get('recording', []), separating])}'"
         way = f"the column {separating!r} keeps them apart ({use})"
-    event = part.events.iloc[row]
+    event = reading.events.iloc[row]
     what = f"{share:.0%} of the bouts overlap another of the same subject and behaviour, such as {event['behaviour']!r}"
-    problems.add(f"{what}; {way}", [int(part.rows[row])], table.place)
+    problems.add(f"{what}; {way}", [int(reading.rows[row])], table.place)
 
 
 def _overlap_share(events: pd.DataFrame) -> tuple[float, int]:
@@ -222,59 +222,59 @@ def _overlapping_rows(events: pd.DataFrame, columns: Sequence[str]) -> tuple[NDA
     return timed[overlapping(unit, *(bouts[end].to_numpy(float) for end in ("start", "stop")))], timed.size
 
 
-def _separating_column(table: Table, part: Part) -> str | None:
+def _separating_column(table: Table, reading: Part) -> str | None:
     """Return an unused column whose values tell overlapping bouts apart; None for none."""
     used = table.roles.used()
     free = [name for name in table.frame if name not in used and 1 < table.frame[name].nunique() <= 20]
     likely = [name for name in free if plain(name) in NAMES["observer"]]
     for name in dict.fromkeys([*likely, *free]):
-        subject = part.events["subject"] + JOIN + table.frame[name].to_numpy(object)[part.rows]
-        events = part.events.assign(subject=subject)
+        subject = reading.events["subject"] + JOIN + table.frame[name].to_numpy(object)[reading.rows]
+        events = reading.events.assign(subject=subject)
         if _overlap_share(events)[0] <= MAX_OVERLAP / 5:
             return str(name)
     return None
 
 
-def _check_factors(part: Part, problems: Problems) -> None:
+def _check_factors(reading: Part, problems: Problems) -> None:
     """Leave out factors that vary within a recording; refuse them where a user named them."""
-    for name in list(part.roles.at.get("factors", [])):
-        first = part.events.groupby(KEYS, sort=False)[name].transform("first")
-        varying = np.flatnonzero((part.events[name] != first).to_numpy())
+    for name in list(reading.roles.at.get("factors", [])):
+        first = reading.events.groupby(KEYS, sort=False)[name].transform("first")
+        varying = np.flatnonzero((reading.events[name] != first).to_numpy())
         if not varying.size:
             continue
-        values = f"{part.events[name].iloc[varying[0]]!r} beside {first.iloc[varying[0]]!r}"
-        if "factors" in part.roles.inferred:
-            part.events = part.events.drop(columns=name)
-            part.roles.at["factors"].remove(name)
-            where = part.sheet.place(int(part.rows[varying[0]]))
+        values = f"{reading.events[name].iloc[varying[0]]!r} beside {first.iloc[varying[0]]!r}"
+        if "factors" in reading.roles.inferred:
+            reading.events = reading.events.drop(columns=name)
+            reading.roles.at["factors"].remove(name)
+            where = reading.sheet.place(int(reading.rows[varying[0]]))
             what = f"the column {name!r} varies within recordings, and is not used as a factor"
-            part.first_notes.append(f"{what} (first in {where}: {values})")
+            reading.first_notes.append(f"{what} (first in {where}: {values})")
         else:
             what = f"the factor {name!r} must not vary within a recording, got {values}"
-            problems.add(what, part.rows[varying].tolist(), part.sheet.place)
+            problems.add(what, reading.rows[varying].tolist(), reading.sheet.place)
 
 
-def _combine(parts: list[Part], notes: list[str], options: Options) -> Recordings:
+def _combine(readings: list[Part], notes: list[str], options: Options) -> Recordings:
     """Return the recordings of all sheets, as the options say."""
-    filled = [part for part in parts if len(part.events)]
+    filled = [reading for reading in readings if len(reading.events)]
     if not filled:
-        raise ReadingError([f"{part.sheet.name}: a row must have a behaviour, got none" for part in parts])
-    if unknown := sorted(set(options.rename).difference(*(part.renamed for part in parts))):
+        raise ReadingError([f"{reading.sheet.name}: a row must have a behaviour, got none" for reading in readings])
+    if unknown := sorted(set(options.rename).difference(*(reading.renamed for reading in readings))):
         raise ReadingError(f"`rename` must hold behaviours that occur, got {unknown[0]!r}")
-    first = [note for part in parts for note in part.first_notes]
+    first = [note for reading in readings for note in reading.first_notes]
     unit = _convert_to_one_unit(filled, first)
     _keep_files_apart(filled, first)
-    events = pd.concat([part.events for part in filled], ignore_index=True)
+    events = pd.concat([reading.events for reading in filled], ignore_index=True)
     labels = pd.unique(events["behaviour"])
     if len(events) >= MIN_EVENTS and len(labels) > MAX_SHARE_OF_LABELS * len(events):
         raise ReadingError(
             f"{filled[0].sheet.name}: behaviours must recur, got {len(labels):,} different ones in {len(events):,}"
             f" events, such as {labels[0]!r} and {labels[-1]!r}; say which column holds them (--columns.behaviour NAME)"
         )
-    offsets = np.cumsum([0, *[int(part.fragment.max()) + 1 for part in filled]])
-    fragment = np.concatenate([part.fragment + offset for part, offset in zip(filled, offsets, strict=False)])
-    factors = list(dict.fromkeys(name for part in filled for name in part.roles.at.get("factors", [])))
-    context = list(dict.fromkeys(name for part in filled for name in part.roles.at.get("context", [])))
+    offsets = np.cumsum([0, *[int(reading.fragment.max()) + 1 for reading in filled]])
+    fragment = np.concatenate([reading.fragment + offset for reading, offset in zip(filled, offsets, strict=False)])
+    factors = list(dict.fromkeys(name for reading in filled for name in reading.roles.at.get("factors", [])))
+    context = list(dict.fromkeys(name for reading in filled for name in reading.roles.at.get("context", [])))
     for name in [*factors, *context]:
         events[name] = events[name].fillna("")
     unowned = events["subject"].eq("").to_numpy()
@@ -290,22 +290,23 @@ def _combine(parts: list[Part], notes: list[str], options: Options) -> Recording
             f"{share:.0%} of the bouts overlap another of the same subject and behaviour across files, such as"
             f" {event['behaviour']!r} of {event['subject']!r}; name the files of one observer, or say --overlaps keep"
         )
-    all_notes = dict.fromkeys([*first, *notes, *(note for part in parts for note in part.notes)])
-    empty = [name for part in parts for name in part.empty]
+    all_notes = dict.fromkeys([*first, *notes, *(note for reading in readings for note in reading.notes)])
+    empty = [name for reading in readings for name in reading.empty]
     sources = tuple(
         Source(
-            part.sheet.name,
-            part.roles.program.name if part.roles.program else "",
-            part.roles.layout,
-            {use: tuple(names) for use, names in part.roles.at.items()},
-            frozenset(part.roles.inferred),
+            reading.sheet.name,
+            reading.roles.program.name if reading.roles.program else "",
+            reading.roles.layout,
+            {use: tuple(names) for use, names in reading.roles.at.items()},
+            frozenset(reading.roles.inferred),
         )
-        for part in parts
+        for reading in readings
     )
     spans = None
-    if any(part.spans is not None for part in filled):
+    if any(reading.spans is not None for reading in filled):
         watched = [
-            Recordings(part.events, part.fragment).watched if part.spans is None else part.spans for part in filled
+            Recordings(reading.events, reading.fragment).watched if reading.spans is None else reading.spans
+            for reading in filled
         ]
         spans = pd.concat(watched, ignore_index=True)
         spans["subject"] = spans["subject"].where(spans["subject"] != "", spans["recording"])
@@ -328,8 +329,8 @@ def _notes_on_twins(events: pd.DataFrame) -> list[str]:
     several = events.groupby("subject")["recording"].transform("nunique") > 1
     pairs = (
         pair
-        for _, own in events[several].groupby("subject", sort=False)
-        for pair in combinations([one for _, one in own.groupby("recording", sort=False)], 2)
+        for _, subject_events in events[several].groupby("subject", sort=False)
+        for pair in combinations([one for _, one in subject_events.groupby("recording", sort=False)], 2)
     )
     notes = []
     for one, other in islice(pairs, MAX_TWIN_PAIRS):
@@ -362,42 +363,42 @@ def _share_matched(one: pd.DataFrame, other: pd.DataFrame) -> float:
     return matched / len(one)
 
 
-def _convert_to_one_unit(parts: list[Part], notes: list[str]) -> str:
+def _convert_to_one_unit(readings: list[Part], notes: list[str]) -> str:
     """Convert the times of several files to the unit of the first, and return it; "" where none says its unit.
 
     Raises:
         ReadingError: units cannot be compared.
     """
-    units = list(dict.fromkeys(part.unit for part in parts if part.unit))
+    units = list(dict.fromkeys(reading.unit for reading in readings if reading.unit))
     if len(units) > 1 and not set(units) <= set(SECONDS):
-        raise ReadingError(f"times must have one unit in all files, got {', '.join(units)} ({parts[-1].sheet.name})")
+        raise ReadingError(f"times must have one unit in all files, got {', '.join(units)} ({readings[-1].sheet.name})")
     if not units:
         return ""
-    for part in parts:
-        if part.unit and part.unit != units[0]:
-            factor = SECONDS[part.unit] / SECONDS[units[0]]
-            part.events[["start", "stop"]] *= factor
-            if part.spans is not None:
-                part.spans[["start", "stop"]] *= factor
-            notes.append(f"the times of {part.sheet.name} are converted to {units[0]}, as in the other files")
-    if not all(part.unit for part in parts):
+    for reading in readings:
+        if reading.unit and reading.unit != units[0]:
+            factor = SECONDS[reading.unit] / SECONDS[units[0]]
+            reading.events[["start", "stop"]] *= factor
+            if reading.spans is not None:
+                reading.spans[["start", "stop"]] *= factor
+            notes.append(f"the times of {reading.sheet.name} are converted to {units[0]}, as in the other files")
+    if not all(reading.unit for reading in readings):
         notes.append(f"some files do not say their unit of time, and are taken to be in {units[0]}")
     return units[0]
 
 
-def _keep_files_apart(parts: list[Part], notes: list[str]) -> None:
+def _keep_files_apart(readings: list[Part], notes: list[str]) -> None:
     """Put the names of files before those of recordings, where several files share one and no subject is known."""
     names: dict[str, set[int]] = {}
-    for number, part in enumerate(parts):
-        for name in pd.unique(part.events["recording"][part.events["subject"] == ""]):
+    for number, reading in enumerate(readings):
+        for name in pd.unique(reading.events["recording"][reading.events["subject"] == ""]):
             names.setdefault(name, set()).add(number)
     twice = {name for name, files in names.items() if len(files) > 1}
     if not twice:
         return
-    for part in parts:
-        for frame in (part.events, part.spans):
+    for reading in readings:
+        for frame in (reading.events, reading.spans):
             if frame is not None:
                 shared = frame["recording"].isin(twice) & (frame["subject"] == "")
-                name = part.sheet.stem + " " + frame["recording"].astype(str)
+                name = reading.sheet.stem + " " + frame["recording"].astype(str)
                 frame["recording"] = frame["recording"].where(~shared, name)
     notes.append(f"{len(twice):,} names of recordings occur in several files, and the files' names are put before them")

@@ -44,9 +44,9 @@ def rows_of_sequences(table: Table) -> Part:
     if (flat == "").any():
         what = f"cells within sequences have no label: {table.after_missing}"
         table.notes.append(f"{(flat == '').sum():,} {what}")
-    part = table.part(rows.astype(np.int64), flat, steps.astype(np.float64), steps + 1.0)
-    part.note_repeats("cells")
-    return part
+    reading = table.part(rows.astype(np.int64), flat, steps.astype(np.float64), steps + 1.0)
+    reading.note_repeats("cells")
+    return reading
 
 
 def _best_separator(texts: Any, separators: list[str]) -> str:

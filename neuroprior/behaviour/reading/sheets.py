@@ -96,7 +96,7 @@ def find_files(path: str | os.PathLike[str]) -> list[Path]:
     path = Path(path)
     if path.is_dir():
         inside = [file for file in path.rglob("*") if _is_table(file)]
-        files = sorted(file for file in inside if not any(part[0] == "." for part in file.relative_to(path).parts))
+        files = sorted(file for file in inside if not any(name[0] == "." for name in file.relative_to(path).parts))
         if not files:
             raise ReadingError(f"{path}: the folder must hold tables ({', '.join(TABLE_SUFFIXES)}), got none")
         return files
@@ -145,9 +145,9 @@ def _sheets_of_bytes(content: bytes, name: str, label: str, wanted: Sequence[str
         yield from _sheets_of_workbook(content, label, stem, wanted)
     elif content[:4] == b"PAR1" or content[:6] == b"ARROW1":
         read = pd.read_parquet if content[:4] == b"PAR1" else pd.read_feather
-        yield sheet_of_frame(_with_extra(label, read, io.BytesIO(content)), label, stem)
+        yield sheet_of_frame(_read_by_pandas(label, read, io.BytesIO(content)), label, stem)
     elif content[:8] == b"\x89HDF\r\n\x1a\n":
-        yield sheet_of_frame(_with_extra(label, pd.read_hdf, label), label, stem)
+        yield sheet_of_frame(_read_by_pandas(label, pd.read_hdf, label), label, stem)
     elif content[:6] == b"\x93NUMPY":
         yield _sheet_without_header(*read_array(content, label), label, stem)
     elif content.lstrip()[:5] == b"<?xml" and b"<log" in content[:2000]:
@@ -176,7 +176,7 @@ def _sheet_without_header(frame: pd.DataFrame, header: bool, label: str, stem: s
     return sheet
 
 
-def _with_extra(label: str, read: Any, source: Any, **options: Any) -> Any:
+def _read_by_pandas(label: str, read: Any, source: Any, **options: Any) -> Any:
     """Return what a reader of pandas returns that may need an extra, with errors of one line."""
     try:
         return read(source, **options)
@@ -205,7 +205,7 @@ def _sheets_of_zip(content: bytes, name: str, label: str, stem: str, wanted: Seq
 
 def _sheets_of_workbook(content: bytes, label: str, stem: str, wanted: Sequence[str]) -> Iterator[Sheet]:
     options = {"sheet_name": None, "header": None, "dtype": object, "engine": "calamine"}
-    pages = _with_extra(label, pd.read_excel, io.BytesIO(content), **options)
+    pages = _read_by_pandas(label, pd.read_excel, io.BytesIO(content), **options)
     filled = {name: page for name, page in pages.items() if page.notna().any(axis=None)}
     if not filled:
         raise ReadingError(f"{label}: the workbook must hold a table, got empty sheets")
@@ -248,7 +248,7 @@ def sheet_of_frame(frame: pd.DataFrame, name: str = "table", stem: str = "table"
         frame = frame.reset_index()
     if isinstance(frame.columns, pd.MultiIndex):
         frame = frame.set_axis([" ".join(map(str, filter(None, one))) for one in frame.columns], axis=1)
-    columns = _distinct([_cell(column) for column in frame.columns])
+    columns = _distinct_names([_cell(column) for column in frame.columns])
     texts = pd.DataFrame({new: _texts(frame.iloc[:, i]) for i, new in enumerate(columns)})
     return Sheet(name, stem, texts, np.arange(len(frame)), is_file=False)
 
@@ -386,7 +386,7 @@ def _sheet_of_cells(
 ) -> Sheet:
     """Return a sheet of rows of cells, with its header and without the lines above it."""
     filled = cells.ne("").any(axis=1).to_numpy()
-    cells, lines = _without_empty_columns(cells[filled]), np.asarray(lines)[filled]
+    cells, lines = _drop_empty_columns(cells[filled]), np.asarray(lines)[filled]
     comment = cells[0].str.startswith("\\").to_numpy()  # the frequencies of Audacity's labels
     if comment.any() and not comment.all():
         cells, lines = cells[~comment].reset_index(drop=True), lines[~comment]
@@ -395,7 +395,7 @@ def _sheet_of_cells(
     sizes = cells.iloc[:2].ne("").sum(axis=1).tolist()
     is_header = remarks == 1 and sizes[0] > 1 and sizes[0] == sizes[1]  # such as "#,animal,behaviour"
     if remarks and not is_header:
-        cells, lines = _without_empty_columns(cells.iloc[remarks:]), lines[remarks:]
+        cells, lines = _drop_empty_columns(cells.iloc[remarks:]), lines[remarks:]
     sheet = Sheet(name, stem, cells, lines, separator=separator)
     top = cells.head(MAX_LINES_ABOVE).to_numpy(dtype=object).tolist()
     at, header = _find_header(top, cells, wanted)
@@ -424,17 +424,19 @@ def _sheet_of_cells(
                     f"{name}, line {line}: a row must have {width} cells, as many as the header, got {size}"
                     f" ({len(rows):,} such rows); quote cells that hold {separator!r}"
                 )
-    sheet.frame = body.set_axis(_distinct([*header, *[""] * (body.shape[1] - len(header))][: body.shape[1]]), axis=1)
+    sheet.frame = body.set_axis(
+        _distinct_names([*header, *[""] * (body.shape[1] - len(header))][: body.shape[1]]), axis=1
+    )
     sheet.lines = lines[at + 1 :]
     return sheet
 
 
-def _without_empty_columns(cells: Any) -> Any:
+def _drop_empty_columns(cells: Any) -> Any:
     cells = cells.loc[:, cells.ne("").any(axis=0)].reset_index(drop=True)
     return cells.set_axis(pd.RangeIndex(cells.shape[1]), axis=1)
 
 
-def _distinct(names: Iterable[str]) -> list[str]:
+def _distinct_names(names: Iterable[str]) -> list[str]:
     """Return names of columns that differ: empty ones become their position, repeated ones get a number."""
     distinct: list[str] = []
     for i, name in enumerate(names):
@@ -467,14 +469,14 @@ def _find_header(top: list[list[str]], cells: Any, wanted: Sequence[str]) -> tup
         if any(program.needs <= set(row) for program in PROGRAMS):
             return at, top[at]
     widths = np.array([max((i for i, cell in enumerate(row, 1) if cell), default=0) for row in top])
-    known = [sum(name in KNOWN_NAMES for name in row) for row in plains]
+    name_counts = [sum(name in KNOWN_NAMES for name in row) for row in plains]
     rows = widths[len(widths) // 2 :]
     usual = int(np.bincount(rows[rows > 0]).argmax()) if rows.size else 0
     for at, row in enumerate(top):
         words = [cell for cell in row if cell]
-        if known[at] < 2 and (len(set(words)) < len(words) or (widths[at] < max(usual - 2, 2) and usual > 1)):
+        if name_counts[at] < 2 and (len(set(words)) < len(words) or (widths[at] < max(usual - 2, 2) and usual > 1)):
             continue
-        above = at > 0 and not _is_header(row, cells, at) and known[at] < 2
+        above = at > 0 and not _is_header(row, cells, at) and name_counts[at] < 2
         if above and widths[at] >= usual:
             break
         if _is_header(row, cells, at):

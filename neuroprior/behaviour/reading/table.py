@@ -158,10 +158,10 @@ class Table:
         return np.array(labels, dtype=object)[codes]
 
     def _name_of_file(self) -> str:
-        name = self._above("observation id", "trial name", "observation", "video")
+        name = self._text_above("observation id", "trial name", "observation", "video")
         return re.sub(r"\s+", " ", name) or self.sheet.stem
 
-    def _above(self, *keys: str) -> str:
+    def _text_above(self, *keys: str) -> str:
         """Return what stands above the header by the first of some names; "" for none."""
         above = {plain(name): value for name, value in self.sheet.above.items()}
         return next((above[key] for key in keys if above.get(key)), "")
@@ -180,7 +180,7 @@ class Table:
     def _subjects(self) -> NDArray[Any]:
         names = self.roles.at.get("subject")
         if not names:
-            return np.full(self.size, self._above("subject name", "animal id", "subject"), dtype=object)
+            return np.full(self.size, self._text_above("subject name", "animal id", "subject"), dtype=object)
         keys = _whole_numbers(self.joined(names))
         nobody = pd.Series(keys, dtype=object).str.lower().isin(NO_SUBJECT).to_numpy()
         if nobody.any():
@@ -370,8 +370,8 @@ class Table:
         fragment = np.cumsum(begin) - 1
         events, fragment, rows = events[~missing].reset_index(drop=True), fragment[~missing], rows[~missing]
         fragment = np.unique(fragment, return_inverse=True)[1].astype(np.int64)
-        part = Part(self.sheet, self.roles, events, fragment, rows, self.unit, self.notes, self.first_notes)
-        return replace(part, empty=self.empty, renamed=self.renamed)
+        reading = Part(self.sheet, self.roles, events, fragment, rows, self.unit, self.notes, self.first_notes)
+        return replace(reading, empty=self.empty, renamed=self.renamed)
 
 
 def _number_rows(columns: list[NDArray[Any]]) -> Integers:

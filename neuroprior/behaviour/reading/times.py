@@ -83,7 +83,7 @@ def read_times(
     words = pd.Series(unique, dtype=object)
     missing = words.str.lower().isin(MISSING_TIMES)
     numbers = pd.to_numeric(words.where(~missing), errors="coerce")
-    words, numbers = _without_thousands(words, numbers, missing, separator)
+    words, numbers = _drop_thousands(words, numbers, missing, separator)
     commas = words[numbers.isna() & ~missing]
     if len(commas) and commas.str.fullmatch(r"-?\d*,\d+").all():
         if separator == "," and commas.str.fullmatch(THOUSANDS).all():
@@ -102,7 +102,7 @@ def read_times(
     return Times(_date_seconds(texts_or_empty, column, day_first)[codes], DATES)
 
 
-def _without_thousands(words: Any, numbers: Any, missing: Any, separator: str) -> tuple[Any, Any]:
+def _drop_thousands(words: Any, numbers: Any, missing: Any, separator: str) -> tuple[Any, Any]:
     """Return texts and numbers without the marks between thousands, where these cannot be decimal marks."""
     rest = words[numbers.isna() & ~missing]
     if len(rest) and rest.str.fullmatch(r"-?\d{1,3}(,\d{3})+\.\d+").any() and rest.str.fullmatch(THOUSANDS).all():
