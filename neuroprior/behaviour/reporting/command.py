@@ -48,8 +48,8 @@ def plans(
             console.print(f"report: {page}. {document.status}", highlight=False, soft_wrap=True)
             shown = True
 
-    given: dict[str, Any] = {"priors": priors, "test": test, "skip": skip, "fits": fits, "reading": reading}
-    document = report(plans, out=out, figures=figures, command=command, each=show_first, **given)
+    settings: dict[str, Any] = {"priors": priors, "test": test, "skip": skip, "fits": fits, "reading": reading}
+    document = report(plans, out=out, figures=figures, command=command, each=show_first, **settings)
     show(document, console)
     console.print(f"report: {page}", highlight=False, soft_wrap=True)
 

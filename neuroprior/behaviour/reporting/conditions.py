@@ -35,16 +35,16 @@ TESTS = {
 }
 
 
-def condition_section(found: Evaluation) -> Part | None:
+def condition_section(evaluation: Evaluation) -> Part | None:
     """Whether behaviour differs between conditions; None where plans have none."""
-    if found.plans.condition is None:
+    if evaluation.plans.condition is None:
         return None
-    result = compare_conditions(found.plans, generator=torch.Generator().manual_seed(0))
+    result = compare_conditions(evaluation.plans, generator=torch.Generator().manual_seed(0))
     names = ["condition_tests", "conditions", "condition_blocks"]
     if result.prediction is None:
         empty = {name: pd.DataFrame() for name in names}
         return Part(Section("Conditions", [result.verdict]), empty, [result.verdict])
-    actions, units = action_names(found.plans), _unit_names(result, found)
+    actions, units = action_names(evaluation.plans), _unit_names(result, evaluation)
     tests, features = _tests(result), result.frame()
     blocks = _blocks(result, result.prediction, units)
     frames = dict(zip(names, (tests, features.drop(columns="parts"), blocks), strict=True))
@@ -60,7 +60,7 @@ def condition_section(found: Evaluation) -> Part | None:
         frames["condition_interaction"] = _interaction(result.interaction, actions)
         tables.append(_interaction_table(result.interaction, frames["condition_interaction"]))
     box = _figure_box(result, features, units)
-    unit = found.recordings.unit if found.recordings is not None else ""
+    unit = evaluation.recordings.unit if evaluation.recordings is not None else ""
     findings = [*_feature_findings(result, features, unit), *_prediction_findings(result, result.prediction)]
     verdicts = [result.verdict]
     if result.contrasts:
@@ -82,7 +82,7 @@ SENTENCES = {
 
 def _feature_findings(result: ConditionComparison, features: pd.DataFrame, unit: str) -> list[Finding]:
     """A finding for each feature; `unit` is that of durations."""
-    two, found = len(result.condition_names) == 2, []
+    two, findings = len(result.condition_names) == 2, []
     for row in features.to_dict("records"):
         family, parts, of_time = row["family"], row["parts"], row["family"] == "durations"
         scale, suffix = (1, f" {unit}".rstrip()) if of_time else (100, " %")
@@ -99,15 +99,15 @@ def _feature_findings(result: ConditionComparison, features: pd.DataFrame, unit:
         sentence += f"; {p_words(p_corrected)}."
         name = f"{family}: {row['feature']}"
         p = float(row["p_value"])
-        found.append(
+        findings.append(
             Finding(name, family, row["feature"], effect, low, high, p, p_corrected, row["significant"], sentence)
         )
-    return found
+    return findings
 
 
 def _pair_findings(pairs: pd.DataFrame) -> list[Finding]:
     """A finding for each feature of each two conditions."""
-    found = []
+    findings = []
     for row in pairs.to_dict("records"):
         pair = f"{row['second']} against {row['first']}"
         of_time = row["family"] == "durations"
@@ -120,13 +120,13 @@ def _pair_findings(pairs: pd.DataFrame) -> list[Finding]:
         name, family = f"{row['feature']}, {pair}", f"{row['family']}, {pair}"
         estimate = (row["difference"], row["low"], row["high"], float(row["p_value"]))
         starred = bool(row["significant"])
-        found.append(Finding(f"{row['family']}: {name}", family, name, *estimate, p_corrected, starred, sentence))
-    return found
+        findings.append(Finding(f"{row['family']}: {name}", family, name, *estimate, p_corrected, starred, sentence))
+    return findings
 
 
 def _interaction_findings(result: ConditionInteraction, frame: pd.DataFrame) -> list[Finding]:
     """A finding for each feature whose difference between conditions may depend on the stratum."""
-    found = []
+    findings = []
     for row in frame.to_dict("records"):
         of_time = row["family"] == "durations"
         differences = listed(
@@ -140,10 +140,10 @@ def _interaction_findings(result: ConditionInteraction, frame: pd.DataFrame) -> 
         sentence = f"The difference in {row['feature']} depends on the stratum ({differences}; {p_words(p_corrected)})."
         family, p = f"{row['family']}, by stratum", float(row["p_value"])
         starred = bool(row["significant"])
-        found.append(
+        findings.append(
             Finding(f"{row['family']}: {name}", family, name, None, None, None, p, p_corrected, starred, sentence)
         )
-    return found
+    return findings
 
 
 def _prediction_findings(result: ConditionComparison, prediction: ConditionPrediction) -> list[Finding]:
@@ -154,15 +154,15 @@ def _prediction_findings(result: ConditionComparison, prediction: ConditionPredi
     interval = f"95 % interval {low:.3g} to {high:.3g} over {item}"
     saved = f"Knowing the condition saves {mean:.3g} bits per behaviour, {interval}"
     told = f"From its sequences, {right:.0f} % of the {item} are given their own condition ({expected:.0f} % by chance)"
-    found = []
+    findings = []
     for name, effect, least, most, sentence in (
         ("bits", mean, low, high, saved),
         ("classifier", prediction.accuracy, None, None, told),
     ):
         p, corrected = result.tests[name]
         starred, text = result.differs(name), f"{sentence}; {p_words(corrected)}."
-        found.append(Finding(name, name, TESTS[name], effect, least, most, p, corrected, starred, text))
-    return found
+        findings.append(Finding(name, name, TESTS[name], effect, least, most, p, corrected, starred, text))
+    return findings
 
 
 def _text(result: ConditionComparison) -> list[str]:
@@ -186,12 +186,12 @@ def _text(result: ConditionComparison) -> list[str]:
     ]
 
 
-def _unit_names(result: ConditionComparison, found: Evaluation) -> list[str]:
+def _unit_names(result: ConditionComparison, evaluation: Evaluation) -> list[str]:
     if result.design.item == "sequences":
-        names = found.plans.recording or ()
-        distinct = len(set(names)) == len(found.plans)
+        names = evaluation.plans.recording or ()
+        distinct = len(set(names)) == len(evaluation.plans)
         return [names[number] if distinct else f"sequence {number}" for number in result.design.units.tolist()]
-    return group_names(found.plans, result.design.units)
+    return group_names(evaluation.plans, result.design.units)
 
 
 def _tests(result: ConditionComparison) -> pd.DataFrame:
@@ -246,8 +246,8 @@ def _pairs(result: ConditionComparison) -> pd.DataFrame:
     parts = []
     for pair in result.contrasts:
         first, second = pair.condition_names
-        part = pair.frame().rename(columns={f"mean, {first}": "mean_first", f"mean, {second}": "mean_second"})
-        parts.append(part.assign(first=first, second=second))
+        frame = pair.frame().rename(columns={f"mean, {first}": "mean_first", f"mean, {second}": "mean_second"})
+        parts.append(frame.assign(first=first, second=second))
     columns = ["first", "second", "family", "feature", "mean_first", "mean_second", "difference", "low", "high"]
     return pd.concat(parts)[[*columns, "p_value", "corrected", "significant"]]
 
@@ -270,27 +270,29 @@ def _pair_table(result: ConditionComparison, pairs: pd.DataFrame) -> Table:
     return table(shown, columns, caption, "Each two conditions")
 
 
-def _interaction(found: ConditionInteraction, actions: list[str]) -> pd.DataFrame:
+def _interaction(interaction: ConditionInteraction, actions: list[str]) -> pd.DataFrame:
     """A row a feature, with the difference between two conditions in each stratum."""
     parts = []
-    for family in found.families:
+    for family in interaction.families:
         parts_of = [[actions[action] for action in feature] for feature in family.features.tolist()]
-        part = pd.DataFrame({"family": family.name, "feature": feature_names(family.name, parts_of)})
+        frame = pd.DataFrame({"family": family.name, "feature": feature_names(family.name, parts_of)})
         differences = family.differences.exp() if family.name == "durations" else family.differences
-        for name, own in zip(found.stratum_names, differences, strict=True):
-            part[f"difference, {name}"] = own.numpy()
-        part["p_value"] = family.p_values.numpy()
-        part["corrected"] = family.corrected.clamp(min=found.tests[family.name][1]).numpy()
-        parts.append(part.assign(significant=part["corrected"] < LEVEL))
+        for name, difference in zip(interaction.stratum_names, differences, strict=True):
+            frame[f"difference, {name}"] = difference.numpy()
+        frame["p_value"] = family.p_values.numpy()
+        frame["corrected"] = family.corrected.clamp(min=interaction.tests[family.name][1]).numpy()
+        parts.append(frame.assign(significant=frame["corrected"] < LEVEL))
     return pd.concat(parts, ignore_index=True).sort_values(["corrected", "p_value"], kind="stable", ignore_index=True)
 
 
-def _interaction_table(found: ConditionInteraction, frame: pd.DataFrame) -> Table:
+def _interaction_table(interaction: ConditionInteraction, frame: pd.DataFrame) -> Table:
     columns: dict[str, Column] = {"feature": "feature"}
-    for name in found.stratum_names:
+    for name in interaction.stratum_names:
         columns[f"difference,\n{name}"] = _cell_of(f"difference, {name}", ".3g")
     columns["p"] = lambda row: p_text(row.corrected) + "*" * row.significant
-    caption = f"{found.verdict} Durations are ratios. p: corrected for the features of a family and for the families."
+    caption = (
+        f"{interaction.verdict} Durations are ratios. p: corrected for the features of a family and for the families."
+    )
     caption += " *: p < 0.05."
     return table(frame[:LISTED], columns, caption, "Do differences depend on the stratum?")
 
@@ -312,7 +314,7 @@ def _blocks(result: ConditionComparison, prediction: ConditionPrediction, units:
     frame = pd.DataFrame({design.item[:-1]: [units[unit] for unit in design.unit.tolist()]})
     frame["condition"] = [names[label] for label in design.label.tolist()]
     frame["classified"] = [names[label] for label in odds.argmax(1).tolist()]
-    return frame.assign(**{f"log odds, {name}": own.numpy() for name, own in zip(names, odds.T, strict=True)})
+    return frame.assign(**{f"log odds, {name}": column.numpy() for name, column in zip(names, odds.T, strict=True)})
 
 
 def _block_table(result: ConditionComparison, prediction: ConditionPrediction, blocks: pd.DataFrame) -> Table:
@@ -334,9 +336,9 @@ def _figure_box(result: ConditionComparison, features: pd.DataFrame, units: list
     design, families = result.design, {family.name: family for family in result.families}
     shown, means, values = features.drop_duplicates("feature")[:DRAWN], [], []
     for row in shown.to_dict("records"):
-        own = _values(families[row["family"]], row["place"])
+        unit_values = _values(families[row["family"]], row["place"])
         name = row["feature"] + "*" * row["significant"]
-        for unit, label, value in zip(design.unit.tolist(), design.label.tolist(), own, strict=True):
+        for unit, label, value in zip(design.unit.tolist(), design.label.tolist(), unit_values, strict=True):
             values.append((name, units[unit], result.condition_names[label], value))
         for condition in result.condition_names:
             means.append((name, condition, *(row[f"{what}, {condition}"] for what in ("mean", "low", "high"))))
@@ -356,5 +358,5 @@ def _figure_box(result: ConditionComparison, features: pd.DataFrame, units: list
 
 def _values(family: ConditionFamily, place: int) -> list[float]:
     values = family.values[:, place]
-    found: list[float] = (values.exp() if family.name == "durations" else values).tolist()
-    return found
+    numbers: list[float] = (values.exp() if family.name == "durations" else values).tolist()
+    return numbers

@@ -148,8 +148,8 @@ def results_of(document: Document) -> dict[str, Any]:
     """What `results.json` holds: the rows of each frame, further results, settings and versions."""
     rows = {document.keys.get(name, name): records(frame) for name, frame in document.frames.items()}
     headline = {"headline": [asdict(one) for one in document.headline]} if document.headline else {}
-    made = {**headline, **document.results, "settings": dict(document.settings), "versions": versions()}
-    return {**rows, **made}
+    rest = {**headline, **document.results, "settings": dict(document.settings), "versions": versions()}
+    return {**rows, **rest}
 
 
 def write_results(folder: Path, content: dict[str, Any]) -> None:
@@ -235,11 +235,13 @@ def _cell(row: Any, column: Column) -> str:
 
 def printed(title: str, table: Table) -> rich.table.Table:
     """A table for a terminal of 80 columns: names are folded where there is no room, numbers are not."""
-    made = rich.table.Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title=Text(title, "table.title"))
+    rich_table = rich.table.Table(
+        box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title=Text(title, "table.title")
+    )
     for heading, side in zip(table.headings, table.align or "", strict=True):
         name = Text(heading, "table.header")
-        made.add_column(name, justify="left" if side == "l" else "right", no_wrap=side == "r", overflow="fold")
+        rich_table.add_column(name, justify="left" if side == "l" else "right", no_wrap=side == "r", overflow="fold")
     for row in table.rows:
-        made.add_row(*map(Text, row))  # names are no markup
-    made.caption = Text(table.caption, "table.caption")
-    return made
+        rich_table.add_row(*map(Text, row))  # names are no markup
+    rich_table.caption = Text(table.caption, "table.caption")
+    return rich_table

@@ -104,9 +104,9 @@ def lines(names: Sequence[str]) -> Iterator[tuple[str, str]]:
 
 
 def _kind(name: str) -> str | None:
-    known = next((color for kind, color in KINDS.items() if kind in name), None)
-    if known is not None or "markov" not in name:
-        return known
+    kind_color = next((color for kind, color in KINDS.items() if kind in name), None)
+    if kind_color is not None or "markov" not in name:
+        return kind_color
     order = "".join(letter for letter in name.split("markov")[1][:3] if letter in "0123456789")
     return MARKOV[min(int(order or 1), len(MARKOV) - 1)]
 

@@ -37,21 +37,21 @@ LEAST = 5e-4
 """Bits; gains below this are 0 in three digits, and not starred."""
 
 
-def duration_section(found: Evaluation) -> Part | None:
+def duration_section(evaluation: Evaluation) -> Part | None:
     """How long actions take, and whether that predicts the next action; None where no plan has durations."""
-    plans = found.plans
+    plans = evaluation.plans
     if plans.durations is None or not bool((plans.durations[plans.mask()] > 0).any()):
         return None
     if len(plans) == 1:
         plans = in_parts(plans, min(BLOCKS, int(plans.mask().sum())))
-    known = plans.mask() & ~durations_of(plans).isnan()
-    model = DurationModel(plans.num_actions).fit(found.plans)
-    gains = _held_out_gains(plans, known)
-    frame = _by_action(plans, known, model, gains)
-    laws = _laws(plans, known, model, gains)
+    timed = plans.mask() & ~durations_of(plans).isnan()
+    model = DurationModel(plans.num_actions).fit(evaluation.plans)
+    gains = _held_out_gains(plans, timed)
+    frame = _action_rows(plans, timed, model, gains)
+    laws = _laws(plans, timed, model, gains)
     dwell = dwell_times(plans, model)
-    following = _following(found, plans, known)
-    over = unit_name(plans, known)
+    following = _next_rows(evaluation, plans, timed)
+    over = unit_name(plans, timed)
     bounds = f"±: 95 % intervals over {over}."
     of_all = f" The {LISTED} commonest of {len(frame)}." if len(frame) > LISTED else ""
     columns: dict[str, Column] = {
@@ -75,7 +75,7 @@ def duration_section(found: Evaluation) -> Part | None:
     caption = "Over exponential laws of each behaviour, and over laws of the line above: durations may depend on the"
     caption += f" next behaviour, too, where that predicts them better. {bounds}"
     tables.append(table(laws, shown, caption, "Laws of durations", "lr"))
-    too_few_units = too_few(found.plans)
+    too_few_units = too_few(evaluation.plans)
     if len(following):
         shown = {"model": "model", "without": "without:.4f", "with": "with:.4f", "gain": _gain}
         caption = f"Bits per held-out behaviour without and with the last duration known. {bounds}"
@@ -93,14 +93,14 @@ def duration_section(found: Evaluation) -> Part | None:
     ]
     caption = "Density of the logarithm of durations above 0 (bars), and of the law that was fitted (line)."
     boxes = [FigureBox(figures.dwell_figure(dwell), caption, "Dwell times of the behaviours with their laws.", "dwell")]
-    survival = duration_survival(found.plans, generator=torch.Generator().manual_seed(0))
+    survival = duration_survival(evaluation.plans, generator=torch.Generator().manual_seed(0))
     frames = {"durations": frame, "duration_laws": laws, "next_by_duration": following, "dwell": dwell}
     frames |= {"survival": survival.frame(), "survival_tests": survival.medians()}
     tables.append(survival_table(survival, too_few_units))
     caption = "The share of bouts that last longer; bouts that were cut off count as long as they were seen."
     caption += f" Bands: 95 % intervals over {over}."
     boxes.append(FigureBox(survival_figure(frames["survival"]), caption, "Survival of bouts.", "survival"))
-    unit = found.recordings.unit if found.recordings is not None else ""
+    unit = evaluation.recordings.unit if evaluation.recordings is not None else ""
     findings = survival_findings(survival, too_few_units, unit)
     for row in following.rename(columns={"gain": "bits"}).to_dict("records"):
         family, what = "next behaviour by duration", f"How long the last behaviour took ({row['model']})"
@@ -108,37 +108,40 @@ def duration_section(found: Evaluation) -> Part | None:
     return Part(Section("Durations", text, tables, boxes), frames, findings=findings)
 
 
-def _parts(plans: RecordedPlans, known: Tensor) -> Iterator[tuple[RecordedPlans, Tensor]]:
+def _parts(plans: RecordedPlans, timed: Tensor) -> Iterator[tuple[RecordedPlans, Tensor]]:
     """The training plans, and the numbers of the held-out ones, of each fold whose training plans have durations."""
     plans = divisible(plans)
     number = num_units(plans)
     for training, held_out in folds(plans, min(FOLDS, number)) if number >= FEWEST_UNITS else []:
-        if bool(((durations_of(plans) > 0) & known)[training].any()):
+        if bool(((durations_of(plans) > 0) & timed)[training].any()):
             yield plans[training], held_out
 
 
-def _held_out_gains(plans: RecordedPlans, known: Tensor) -> dict[str, Tensor]:
+def _held_out_gains(plans: RecordedPlans, timed: Tensor) -> dict[str, Tensor]:
     """`[N, L]`, nats: what the law of each action gains over an exponential one, and laws of transitions over that.
 
     NaN where there is no held-out duration above 0.
     """
-    found = {what: torch.full(known.shape, torch.nan, dtype=torch.double) for what in ("law", "transition")}
-    above = known & (durations_of(plans) > 0)
-    for training, held_out in _parts(plans, known):
-        part, here = plans[held_out], above[held_out]
+    all_gains = {what: torch.full(timed.shape, torch.nan, dtype=torch.double) for what in ("law", "transition")}
+    above = timed & (durations_of(plans) > 0)
+    for training, held_out in _parts(plans, timed):
+        test_plans, timed_steps = plans[held_out], above[held_out]
         # Each action as a plan of its own has no next action: its law is that of the action.
-        times = durations_of(part)[here][:, None]
-        alone = RecordedPlans(part.actions[here][:, None], plans.num_actions, durations=times)
+        times = durations_of(test_plans)[timed_steps][:, None]
+        alone = RecordedPlans(test_plans.actions[timed_steps][:, None], plans.num_actions, durations=times)
         model = DurationModel(plans.num_actions).fit(training)
         plain = DurationModel(plans.num_actions, ["exponential"], transitions=False).fit(training)
-        own = model.log_prob(alone)[:, 0]
-        gains = {"law": own - plain.log_prob(alone)[:, 0], "transition": model.log_prob(part)[here] - own}
+        log_probs = model.log_prob(alone)[:, 0]
+        gains = {
+            "law": log_probs - plain.log_prob(alone)[:, 0],
+            "transition": model.log_prob(test_plans)[timed_steps] - log_probs,
+        }
         for what, gain in gains.items():
-            found[what][held_out] = found[what][held_out].masked_scatter(here, gain)
-    return found
+            all_gains[what][held_out] = all_gains[what][held_out].masked_scatter(timed_steps, gain)
+    return all_gains
 
 
-def _by_unit(values: Tensor, plans: RecordedPlans, mask: Tensor) -> dict[str, float]:
+def _mean_over_units(values: Tensor, plans: RecordedPlans, mask: Tensor) -> dict[str, float]:
     """The mean of `values [N, L]` where they are finite and in `mask`, with its interval over independent units."""
     mask = mask & values.isfinite()
     nothing = {"gain": np.nan, "low": np.nan, "high": np.nan, "p_value": np.nan, "units": 0}
@@ -149,11 +152,11 @@ def _by_unit(values: Tensor, plans: RecordedPlans, mask: Tensor) -> dict[str, fl
     return {"gain": gain, "low": low, "high": high, "p_value": p_value, "units": len(score.bits)}
 
 
-def _by_action(plans: RecordedPlans, known: Tensor, model: DurationModel, gains: dict[str, Tensor]) -> pd.DataFrame:
+def _action_rows(plans: RecordedPlans, timed: Tensor, model: DurationModel, gains: dict[str, Tensor]) -> pd.DataFrame:
     """A row an action, the commonest first: its durations, their law, and what this gains over an exponential one."""
     names, taken = action_names(plans), plans.mask()
     laws = model.table()
-    times = pd.DataFrame({"behaviour": plans.actions[known].tolist(), "time": durations_of(plans)[known].tolist()})
+    times = pd.DataFrame({"behaviour": plans.actions[timed].tolist(), "time": durations_of(plans)[timed].tolist()})
     groups = times.groupby("behaviour")["time"]
     summary = groups.describe(percentiles=[0.25, 0.5, 0.75]).reindex(range(plans.num_actions))
     number = plans.actions[taken].long().bincount(minlength=plans.num_actions)
@@ -161,52 +164,52 @@ def _by_action(plans: RecordedPlans, known: Tensor, model: DurationModel, gains:
     for action in number.argsort(descending=True, stable=True).tolist():
         if not number[action]:
             continue
-        own, law = summary.loc[action], laws[action]
-        count = 0 if np.isnan(own["count"]) else int(own["count"])
+        stats, law = summary.loc[action], laws[action]
+        count = 0 if np.isnan(stats["count"]) else int(stats["count"])
         row = {"behaviour": names[action], "known": count, "unknown": int(number[action]) - count, "zero": law.zero}
-        row |= {"quartile_1": own["25%"], "median": own["50%"], "quartile_3": own["75%"], "mean": own["mean"]}
+        row |= {"quartile_1": stats["25%"], "median": stats["50%"], "quartile_3": stats["75%"], "mean": stats["mean"]}
         row |= {"law": law.law if law.number else "of all"}
         row |= {"parameters": ", ".join(f"{name} {value:.4g}" for name, value in law.parameters.items())}
-        rows.append(row | _by_unit(gains["law"], plans, known & (plans.actions == action)))
+        rows.append(row | _mean_over_units(gains["law"], plans, timed & (plans.actions == action)))
     return pd.DataFrame(rows)
 
 
-def _laws(plans: RecordedPlans, known: Tensor, model: DurationModel, gains: dict[str, Tensor]) -> pd.DataFrame:
+def _laws(plans: RecordedPlans, timed: Tensor, model: DurationModel, gains: dict[str, Tensor]) -> pd.DataFrame:
     """What laws of actions gain over exponential ones, and laws of transitions over those of actions."""
     number = len({row.action for row in model.table() if row.next_action is not None})
     names = {
         "law": "the law of each behaviour",
         "transition": f"and of each transition (in {number} of {plans.num_actions} behaviours)",
     }
-    return pd.DataFrame([{"what": name} | _by_unit(gains[what], plans, known) for what, name in names.items()])
+    return pd.DataFrame([{"what": name} | _mean_over_units(gains[what], plans, timed) for what, name in names.items()])
 
 
-def _following(found: Evaluation, plans: RecordedPlans, known: Tensor) -> pd.DataFrame:
+def _next_rows(evaluation: Evaluation, plans: RecordedPlans, timed: Tensor) -> pd.DataFrame:
     """Bits per action with and without the last duration known: of a chain, and of networks that took them."""
     rows = []
     if plans.num_actions <= MOST_ACTIONS:
-        bits, mask = chain_bits(plans, known)
+        bits, mask = chain_bits(plans, timed)
         if int(mask.sum()) >= FEWEST_UNITS:
             scores = [score_bits("", "", one, plans, mask) for one in bits]
-            rows.append({"model": "markov-1"} | _compared(*scores))
-    for model in found.models:
-        plain = next((one for one in found.models if (one.name, one.inputs) == (model.name, ACTIONS)), None)
+            rows.append({"model": "markov-1"} | _compare(*scores))
+    for model in evaluation.models:
+        plain = next((one for one in evaluation.models if (one.name, one.inputs) == (model.name, ACTIONS)), None)
         if model.inputs == DURATIONS and plain is not None:
-            rows.append({"model": model.name} | _compared(plain.score, model.score))
+            rows.append({"model": model.name} | _compare(plain.score, model.score))
     frame = pd.DataFrame(rows)
     if rows:  # a loss, or a gain that is 0 in three digits, is none that was looked for
         frame["corrected"] = holm(frame["p_value"].where(frame["gain"] >= LEAST, 1.0))
-        frame["starred"] = (frame["corrected"] < LEVEL) & (not too_few(found.plans))
+        frame["starred"] = (frame["corrected"] < LEVEL) & (not too_few(evaluation.plans))
     return frame
 
 
-def _compared(without: Score, known: Score) -> dict[str, Any]:
-    gain, low, high, p_value = without.minus(known)
-    bits = {"without": without.bits_per_action().mean, "with": known.bits_per_action().mean}
-    return bits | {"gain": gain, "low": low, "high": high, "p_value": p_value, "units": len(known.bits)}
+def _compare(without: Score, with_duration: Score) -> dict[str, Any]:
+    gain, low, high, p_value = without.minus(with_duration)
+    bits = {"without": without.bits_per_action().mean, "with": with_duration.bits_per_action().mean}
+    return bits | {"gain": gain, "low": low, "high": high, "p_value": p_value, "units": len(with_duration.bits)}
 
 
-def chain_bits(plans: RecordedPlans, known: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
+def chain_bits(plans: RecordedPlans, timed: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
     """The held-out bits of each action under a chain of order 1, and under one that knows the last duration.
 
     The second counts the actions after each action with each class of its duration, and backs off to the first as the
@@ -214,14 +217,14 @@ def chain_bits(plans: RecordedPlans, known: Tensor) -> tuple[tuple[Tensor, Tenso
 
     Args:
         plans: N of them, with durations.
-        known: `[N, L]` bool: where durations are known.
+        timed: `[N, L]` bool: where durations are known.
 
     Returns:
         Both `[N, L]`, float64; and where they have values: after a known duration, if others can be learned from.
     """
     actions, step, unit = actions_in_a_row(plans)
     fold, last, mask = unit % MAX_FOLDS, np.roll(actions, 1), plans.mask().cpu()
-    time = np.roll(durations_of(plans).masked_fill(~known, torch.nan).cpu()[mask].double().numpy(), 1)
+    time = np.roll(durations_of(plans).masked_fill(~timed, torch.nan).cpu()[mask].double().numpy(), 1)
     after_known = (step > 0) & ~np.isnan(time)
     without = bits_after(last, actions, fold, bits_of_shares(actions, fold, plans.num_actions), step > 0)
     knowing, scored = without.copy(), np.zeros_like(after_known)
@@ -251,22 +254,22 @@ def dwell_times(plans: RecordedPlans, model: DurationModel) -> pd.DataFrame:
         of durations of 0), `law`, `low` and `high` (the edges), `density` and `fitted`: shares by unit of the natural
         logarithm, of the durations and of the law.
     """
-    known = plans.mask() & (durations_of(plans) > 0)
-    times, actions = durations_of(plans)[known].double(), plans.actions[known].long()
+    positive = plans.mask() & (durations_of(plans) > 0)
+    times, actions = durations_of(plans)[positive].double(), plans.actions[positive].long()
     step, rows, names, laws = resolution(times), [], action_names(plans), model.table()
     count = actions.bincount(minlength=plans.num_actions)
     for action in count.argsort(descending=True, stable=True).tolist():
         if not count[action]:
             continue
-        own = times[actions == action]
-        edges = torch.from_numpy(_bins(own.numpy(), step))
-        share = torch.histogram(own, edges)[0] / len(own)
+        action_times = times[actions == action]
+        edges = torch.from_numpy(_bins(action_times.numpy(), step))
+        share = torch.histogram(action_times, edges)[0] / len(action_times)
         width = edges.log().diff()
         zero = laws[action].zero
         fitted = model.cdf(action, edges).diff() / max(1 - zero, 1e-12)
         law = laws[action].law if laws[action].number else f"{laws[action].law}, of all"
         columns = {"low": edges[:-1], "high": edges[1:], "density": share / width, "fitted": fitted / width}
-        row = {"behaviour": names[action], "number": len(own), "zero": zero, "law": law}
+        row = {"behaviour": names[action], "number": len(action_times), "zero": zero, "law": law}
         rows.append(pd.DataFrame({what: column.numpy() for what, column in columns.items()}).assign(**row))
     frame = pd.concat(rows, ignore_index=True)
     return frame[["behaviour", "number", "zero", "law", "low", "high", "density", "fitted"]]

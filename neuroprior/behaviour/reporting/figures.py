@@ -72,8 +72,8 @@ GAMMA = 0.7
 
 def model_names(frame: pd.DataFrame) -> pd.Series:
     """The names of models with their input, from the columns `model` and `input`."""
-    given = frame["input"].str.extract("(context|durations)")[0]
-    return frame["model"] + (", with " + given).fillna("")
+    model_input = frame["input"].str.extract("(context|durations)")[0]
+    return frame["model"] + (", with " + model_input).fillna("")
 
 
 def lag_names(lags: pd.DataFrame) -> pd.Series:
@@ -101,12 +101,12 @@ def score_figure(scores: pd.DataFrame) -> Figure:
     limit = _edge(best.dropna().to_numpy())
     color = dict(zip(best.index, colors(list(best.index)), strict=True))
     for y, model in enumerate(models):
-        own = scores[scores["model"] == model].sort_values("input", key=lambda names: names.map([*styles].index))
-        reach = (0, 0.17, 0.26)[len(own) - 1]
-        for row, place in zip(own.itertuples(), np.linspace(reach, -reach, len(own)), strict=True):
+        rows = scores[scores["model"] == model].sort_values("input", key=lambda names: names.map([*styles].index))
+        reach = (0, 0.17, 0.26)[len(rows) - 1]
+        for row, place in zip(rows.itertuples(), np.linspace(reach, -reach, len(rows)), strict=True):
             estimate, (shape, hollow) = (row.bits_per_behaviour, row.low, row.high), styles[row.input]
             dot(axes, y + place, estimate, color[model], many and hollow, (-np.inf, limit), shape)
-        values = ", ".join("" if np.isnan(bits) else f"{bits:.3f}" for bits in floats(own["bits_per_behaviour"]))
+        values = ", ".join("" if np.isnan(bits) else f"{bits:.3f}" for bits in floats(rows["bits_per_behaviour"]))
         axes.text(1.03, y, values, transform=axes.get_yaxis_transform(), va="center")
     names_down(axes, [short(model, 36) for model in models])
     axes.set_xlabel("bits per behaviour (less is better)")
@@ -144,8 +144,8 @@ def lag_figure(lags: pd.DataFrame) -> Figure:
         axes.set_yscale("symlog", linthresh=linear, linscale=0.6)
         axes.yaxis.set_major_formatter(DIGITS)
     curves = dict(iter(lags.groupby(lag_names(lags), sort=False)))
-    for (name, own), (color, line) in zip(curves.items(), lines(list(curves)), strict=True):
-        band(axes, own[["lag", "bits", "low", "high"]].to_numpy(), color, short(name, 40), line)
+    for (name, curve), (color, line) in zip(curves.items(), lines(list(curves)), strict=True):
+        band(axes, curve[["lag", "bits", "low", "high"]].to_numpy(), color, short(name, 40), line)
     axes.axhline(0, color=INK, lw=0.8)
     whole_numbers(axes, "steps back", "bits")
     legend(figure, axes.get_legend_handles_labels()[0])
@@ -170,13 +170,13 @@ def dwell_figure(dwell: pd.DataFrame) -> Figure:
     down = -(-len(shown) // across)
     size = (WIDTH if across > 1 else 5, 1.9 * down + 0.5)
     figure, cells = panels(down, across, size)
-    for axes, (name, own) in zip(cells, shown, strict=False):
-        low, high = floats(own["low"]), floats(own["high"])
-        axes.bar(low, floats(own["density"]), high - low, align="edge", color=PLAIN, alpha=0.45, lw=0)
-        axes.plot(np.sqrt(low * high), floats(own["fitted"]), color=MORE, lw=1.8)
-        zero = float(own["zero"].iloc[0])
+    for axes, (name, histogram) in zip(cells, shown, strict=False):
+        low, high = floats(histogram["low"]), floats(histogram["high"])
+        axes.bar(low, floats(histogram["density"]), high - low, align="edge", color=PLAIN, alpha=0.45, lw=0)
+        axes.plot(np.sqrt(low * high), floats(histogram["fitted"]), color=MORE, lw=1.8)
+        zero = float(histogram["zero"].iloc[0])
         at_zero = f", {100 * zero:.0f} % at 0" if zero else ""
-        axes.set_title(f"{short(str(name), 20)}\n{own['law'].iloc[0]}{at_zero}", fontsize=9)
+        axes.set_title(f"{short(str(name), 20)}\n{histogram['law'].iloc[0]}{at_zero}", fontsize=9)
         axes.set_xscale("log")
         decades(axes, low.min(), high.max())
         axes.set(yticks=[], ylim=(0, None))
@@ -205,7 +205,7 @@ def transition_figure(matrix: ArrayLike, names: Sequence[str], title: str = "", 
     _cells(axes, probs / top, PLAIN)
     for a, b in np.argwhere(np.isfinite(probs)) if numbered else []:
         axes.text(b, a, f"{probs[a, b]:.2f}", ha="center", va="center", fontsize=7.5 if small else 9)
-    _named(axes, names, 7.5 if small or len(probs) > 20 else 10)
+    _write_names(axes, names, 7.5 if small or len(probs) > 20 else 10)
     axes.set(xlabel="next behaviour", ylabel="last behaviour", title=clean(title))
     if not small:
         _scale(axes, 0, top, PLAIN, "probability")
@@ -248,7 +248,7 @@ def group_transition_figure(
         axes.plot(b, a, "o", ms=min(5, 45 / len(names)), color=INK, mew=0)
         axes.set_title(short(group_names[group], 22 if across < 4 else 17), fontsize=9)
         if len(names) <= 12:
-            _named(axes, names, 8, left=number % across == 0, below=number >= len(chosen) - across)
+            _write_names(axes, names, 8, left=number % across == 0, below=number >= len(chosen) - across)
         else:
             axes.set(xticks=[], yticks=[])
     at_edges(cells, len(chosen), across, "next behaviour", "last behaviour")
@@ -276,9 +276,9 @@ def condition_figure(means: pd.DataFrame, values: pd.DataFrame, paired: bool = F
     figure, cells = panels(len(features), 1, (WIDTH, height * len(features) + 0.5))
     hues = level_colors(conditions)
     for axes, feature in zip(cells, features, strict=True):
-        own, mean = values[values["feature"] == feature], means[means["feature"] == feature]
-        wide = own.pivot(index="unit", columns="condition", values="value").reindex(columns=conditions)
-        wide = wide.iloc[_evenly(len(wide), MOST_DOTS * (1 if paired else len(conditions)))]
+        unit_values, mean = values[values["feature"] == feature], means[means["feature"] == feature]
+        wide = unit_values.pivot(index="unit", columns="condition", values="value").reindex(columns=conditions)
+        wide = wide.iloc[_spread(len(wide), MOST_DOTS * (1 if paired else len(conditions)))]
         places = -np.arange(len(conditions), dtype=np.float64)
         if paired:
             axes.plot(wide.to_numpy().T, places, color=INK, lw=0.7, alpha=0.3)
@@ -307,8 +307,8 @@ def motif_figure(motifs: pd.DataFrame) -> Figure:
     heights = np.array([0.5 + 0.5 * (1 + name.count("\n")) for name in names])
     figure, (axes,) = panels(1, 1, (WIDTH, 0.9 + 0.3 * max(heights.sum(), 2)))
     ratios = floats(motifs["ratio"])
-    known = ratios[np.isfinite(ratios) & (ratios > 0)]
-    reach = 2 ** max(1.25 * float(np.abs(np.log2(known)).max(initial=0)), 1.0)
+    finite = ratios[np.isfinite(ratios) & (ratios > 0)]
+    reach = 2 ** max(1.25 * float(np.abs(np.log2(finite)).max(initial=0)), 1.0)
     axes.axvline(1, color=INK, lw=0.8, alpha=0.6)
     places = np.cumsum(heights) - heights / 2
     estimates = floats(motifs[["ratio", "low", "high"]].to_numpy())
@@ -358,32 +358,32 @@ def ethogram_figure(plans: Plans) -> Figure:
     whole = np.flatnonzero(mask.any(1))
     row_of = _rows_of(plans, whole)
     starts_row = np.unique(row_of, return_index=True)[1]
-    some = whole[starts_row[_evenly(len(starts_row), MOST_ROWS)]]  # the first plan of each row
+    chosen = whole[starts_row[_spread(len(starts_row), MOST_ROWS)]]  # the first plan of each row
     group, condition = (
-        np.zeros(len(some), int) if values is None else values.cpu().numpy()[some]
+        np.zeros(len(chosen), int) if values is None else values.cpu().numpy()[chosen]
         for values in (plans.group, plans.condition)
     )
     order = np.lexsort((group, condition))
-    some, group, condition = some[order], group[order], condition[order]
-    first = np.arange(len(some)) == 0
+    chosen, group, condition = chosen[order], group[order], condition[order]
+    first = np.arange(len(chosen)) == 0
     new_condition = first | (np.diff(condition, prepend=0) != 0)
     new_group = new_condition | (np.diff(group, prepend=0) != 0)
     # Strips of five lines, the last of them blank; more blank lines before a group, and still more before a condition.
-    tops = 5 * np.arange(len(some)) + np.cumsum(3 * new_group + 10 * new_condition * (plans.condition is not None))
+    tops = 5 * np.arange(len(chosen)) + np.cumsum(3 * new_group + 10 * new_condition * (plans.condition is not None))
     lines = int(tops[-1]) + 5
     place = np.full(len(starts_row), -1)
-    place[row_of[np.searchsorted(whole, some)]] = np.arange(len(some))
+    place[row_of[np.searchsorted(whole, chosen)]] = np.arange(len(chosen))
     parts = np.argsort(place[row_of], kind="stable")
     parts = parts[place[row_of[parts]] >= 0]
     drawn_plans, rows = plans[torch.from_numpy(whole[parts])], place[row_of[parts]]
     in_time = _known_times(drawn_plans)
-    shown, longest = (_in_real_time if in_time else _over_time)(drawn_plans, rows)
+    shown, longest = (_strips_in_time if in_time else _strips_by_duration)(drawn_plans, rows)
     image = np.zeros((lines, shown.shape[1], 4))
     image[np.add.outer(tops, range(4))] = palette[shown][:, None]
     figure, (axes,) = panels(1, 1, (WIDTH, 0.034 * lines + 0.7 + 0.22 * -(-len(keys) // columns)))
     axes.imshow(image, aspect="auto", interpolation="none", extent=(0, longest, lines, 0))
     starts = np.flatnonzero(new_group)
-    middle = (tops[starts] + tops[np.append(starts[1:], len(some)) - 1]) / 2 + 2
+    middle = (tops[starts] + tops[np.append(starts[1:], len(chosen)) - 1]) / 2 + 2
     called = group_names(plans, torch.from_numpy(group[starts]))
     axes.set_yticks([], []) if plans.group is None else axes.set_yticks(middle, [short(c, 18) for c in called])
     axes.tick_params(axis="y", length=0, labelsize=8)
@@ -394,7 +394,9 @@ def ethogram_figure(plans: Plans) -> Figure:
     axes.xaxis.set_major_locator(MaxNLocator(integer=plans.durations is None and not in_time, min_n_ticks=1))
     across = "behaviour of the sequence" if plans.durations is None else "time, in the unit of the durations"
     across = "time since the first behaviour, in the unit of the recordings" if in_time else across
-    axes.set_xlabel(across + (f"; {len(some)} of {len(starts_row)} sequences" if len(some) < len(starts_row) else ""))
+    axes.set_xlabel(
+        across + (f"; {len(chosen)} of {len(starts_row)} sequences" if len(chosen) < len(starts_row) else "")
+    )
     figure.legend(handles=keys, loc="outside lower left", ncols=columns, fontsize=9, handlelength=1, columnspacing=1.4)
     return figure
 
@@ -418,8 +420,8 @@ def _known_times(plans: RecordedPlans) -> bool:
     return bool(plans.began[mask].isfinite().all()) and float(plans.began[mask].max()) > float(plans.began[mask].min())
 
 
-def _in_real_time(plans: RecordedPlans, row: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
-    """The action `[R, bins]` in R rows at evenly spaced times of their recordings, A for none; see `_over_time`."""
+def _strips_in_time(plans: RecordedPlans, row: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
+    """The action `[R, bins]` in R rows at evenly spaced times of their recordings; else as `_strips_by_duration`."""
     mask = plans.mask().cpu().numpy()
     assert plans.began is not None
     began = plans.began.cpu().double().numpy()[mask]
@@ -433,15 +435,15 @@ def _in_real_time(plans: RecordedPlans, row: NDArray[np.int64]) -> tuple[NDArray
     at = (np.arange(MOST_BINS) + 0.5) * longest / MOST_BINS
     shown = np.full((len(first), MOST_BINS), plans.num_actions)
     for number in range(len(first)):
-        own = np.flatnonzero(at_row == number)
-        own = own[np.argsort(begin[own], kind="stable")]
-        last = np.searchsorted(begin[own], at, side="right") - 1
-        inside = (last >= 0) & (at < end[own][last]) & (np.isfinite(end[own][last]) | (last < len(own) - 1))
-        shown[number] = np.where(inside, actions[own][last], plans.num_actions)
+        in_row = np.flatnonzero(at_row == number)
+        in_row = in_row[np.argsort(begin[in_row], kind="stable")]
+        last = np.searchsorted(begin[in_row], at, side="right") - 1
+        inside = (last >= 0) & (at < end[in_row][last]) & (np.isfinite(end[in_row][last]) | (last < len(in_row) - 1))
+        shown[number] = np.where(inside, actions[in_row][last], plans.num_actions)
     return shown, longest
 
 
-def _over_time(plans: RecordedPlans, row: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
+def _strips_by_duration(plans: RecordedPlans, row: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
     """The action `[R, bins]` in R rows at evenly spaced times, A for none, and how long the longest row takes.
 
     Args:
@@ -464,14 +466,14 @@ def _over_time(plans: RecordedPlans, row: NDArray[np.int64]) -> tuple[NDArray[np
         times, bins = np.where(taken, np.nan, 0.0), MOST_BINS
         times[at_row, at] = plans.durations.cpu().double().numpy()[plan, step]
     unknown = np.isnan(times)
-    known = times[taken & ~unknown]
-    ends = np.where(unknown, np.median(known) if known.size else 1.0, times).cumsum(1)
+    observed = times[taken & ~unknown]
+    ends = np.where(unknown, np.median(observed) if observed.size else 1.0, times).cumsum(1)
     longest = float(ends.max()) or 1.0
     at = (np.arange(bins) + 0.5) * longest / bins
     shown = np.where(unknown | ~taken, plans.num_actions, actions)
     shown = np.pad(shown, ((0, 0), (0, 1)), constant_values=plans.num_actions)
     return np.stack(
-        [own[np.searchsorted(end, at, side="right")] for own, end in zip(shown, ends, strict=True)]
+        [strip[np.searchsorted(end, at, side="right")] for strip, end in zip(shown, ends, strict=True)]
     ), longest
 
 
@@ -498,8 +500,8 @@ def occupancy_figure(occupancy: pd.DataFrame) -> Figure:
     figure, (axes,) = panels(1, 1, (WIDTH, 2.8))
     names = list(occupancy["mode"].unique())
     for number, name in enumerate(names):
-        own = occupancy[occupancy["mode"] == name]
-        band(axes, own[["part", "share", "low", "high"]].to_numpy(float), STRIPS[number % len(STRIPS)], name, "-")
+        mode_rows = occupancy[occupancy["mode"] == name]
+        band(axes, mode_rows[["part", "share", "low", "high"]].to_numpy(float), STRIPS[number % len(STRIPS)], name, "-")
     whole_numbers(axes, f"part of the sequence, of {occupancy['part'].max()}", "share of the behaviours")
     axes.set_ylim(bottom=0)
     legend(figure, axes.get_legend_handles_labels()[0])
@@ -518,7 +520,7 @@ def drift_figure(drift: pd.DataFrame, plans: pd.DataFrame) -> Figure:
     """
     parts, groups = (drift[drift["what"] == what] for what in ("place", "subject"))
     ranked = groups[groups["bits"].notna()].sort_values("bits", kind="stable")
-    ranked = ranked.iloc[_evenly(len(ranked), MOST_GROUPS)]
+    ranked = ranked.iloc[_spread(len(ranked), MOST_GROUPS)]
     low = 0.9 + 0.24 * max(len(ranked), 2)
     figure = Figure(figsize=(WIDTH, 3.1 + low), layout="constrained")
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=[3.1, low])[:, 0]
@@ -539,19 +541,19 @@ def drift_figure(drift: pd.DataFrame, plans: pd.DataFrame) -> Figure:
 
 def _cloud(axes: Axes, index: Array, bits: Array) -> None:
     """Bits of each plan against its place in its group, and the means of neighbouring places."""
-    some = _evenly(len(index), MOST_PLANS)
-    axes.plot(index[some], bits[some], "o", ms=3.5, mew=0, color=INK, alpha=0.3)
-    known = np.isfinite(bits)
-    places = np.unique(index[known])
+    chosen = _spread(len(index), MOST_PLANS)
+    axes.plot(index[chosen], bits[chosen], "o", ms=3.5, mew=0, color=INK, alpha=0.3)
+    finite = np.isfinite(bits)
+    places = np.unique(index[finite])
     parts = np.array_split(places, min(20, len(places))) if len(places) else []
-    means = [bits[known & (index >= part[0]) & (index <= part[-1])].mean() for part in parts]
-    axes.plot([part.mean() for part in parts], means, color=MORE, lw=2.2)
+    means = [bits[finite & (index >= chunk[0]) & (index <= chunk[-1])].mean() for chunk in parts]
+    axes.plot([chunk.mean() for chunk in parts], means, color=MORE, lw=2.2)
     whole_numbers(axes, "number of the sequence of its subject", "")
-    of_all = f" ({len(some):,} of {len(index):,} drawn)" if len(some) < len(index) else ""
+    of_all = f" ({len(chosen):,} of {len(index):,} drawn)" if len(chosen) < len(index) else ""
     axes.set_title("from sequence to sequence" + of_all)
 
 
-def _evenly(number: int, most: int) -> list[int]:
+def _spread(number: int, most: int) -> list[int]:
     """At most `most` of `number` places, evenly spaced from the first to the last."""
     places: list[int] = np.unique(np.linspace(0, number - 1, min(number, most)).round().astype(int)).tolist()
     return places
@@ -559,9 +561,9 @@ def _evenly(number: int, most: int) -> list[int]:
 
 def _shades(values: Array, more: str) -> Array:
     """Colours `[..., 4]` of values from -1 to 1: the page shows through where they are small or NaN."""
-    known = np.nan_to_num(np.clip(values, -1, 1))
+    clipped = np.nan_to_num(np.clip(values, -1, 1))
     hues = np.array([to_rgb(FEWER), to_rgb(more)])
-    return np.concatenate([hues[(known > 0).astype(int)], DEEPEST * np.abs(known)[..., None] ** GAMMA], -1)
+    return np.concatenate([hues[(clipped > 0).astype(int)], DEEPEST * np.abs(clipped)[..., None] ** GAMMA], -1)
 
 
 def _cells(axes: Axes, values: Array, more: str) -> None:
@@ -574,14 +576,14 @@ def _cells(axes: Axes, values: Array, more: str) -> None:
         spine.set(visible=True, alpha=0.3)
 
 
-def _named(axes: Axes, names: Sequence[str], size: float, left: bool = True, below: bool = True) -> None:
+def _write_names(axes: Axes, names: Sequence[str], size: float, left: bool = True, below: bool = True) -> None:
     """Names of actions down the left side and below; some of them where they are many."""
-    some = range(0, len(names), -(-len(names) // MOST_NAMES))
-    shown = [short(names[place], 24) for place in some]
+    places = range(0, len(names), -(-len(names) // MOST_NAMES))
+    shown = [short(names[place], 24) for place in places]
     turned = 0 if max(map(len, shown)) <= 5 and len(shown) <= NUMBERED else 90
-    axes.set_xticks(some, shown if below else [""] * len(shown), rotation=turned, fontsize=size)
-    axes.set_yticks(some, shown if left else [""] * len(shown), fontsize=size)
-    axes.tick_params(length=0 if len(some) == len(names) else 2)
+    axes.set_xticks(places, shown if below else [""] * len(shown), rotation=turned, fontsize=size)
+    axes.set_yticks(places, shown if left else [""] * len(shown), fontsize=size)
+    axes.tick_params(length=0 if len(places) == len(names) else 2)
 
 
 def _scale(axes: Axes | list[Axes], low: float, high: float, more: str, label: str) -> None:

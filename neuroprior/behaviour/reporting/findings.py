@@ -43,9 +43,9 @@ class Finding:
 
     def row(self) -> dict[str, Any]:
         """The finding as `results.json` has it: without the sentence."""
-        found = asdict(self)
-        del found["sentence"]
-        return found
+        row = asdict(self)
+        del row["sentence"]
+        return row
 
 
 def gain_finding(family: str, feature: str, what: str, row: Mapping[Any, Any]) -> Finding:
@@ -76,7 +76,7 @@ def headline(verdicts: Sequence[str], sections: Sequence[Sequence[Finding]]) -> 
         sections: the findings of each section, the weightiest first; those that are starred are said.
     """
     starred = [[one for one in findings if one.starred] for findings in sections]
-    places = [(rank, number) for number, some in enumerate(starred) for rank in range(len(some))]
+    places = [(rank, number) for number, section in enumerate(starred) for rank in range(len(section))]
     room = max(MOST_SENTENCES - len(verdicts), 2)
     kept = sorted(places)[: room if len(places) <= room else room - 1]
     said = [Sentence(verdict) for verdict in verdicts]

@@ -138,23 +138,23 @@ def fit_and_score(plans: Plans, test: Plans | None, design: Design, job: Job) ->
     whole = plans if test is None else test
     scored = whole[index]
     if job.inputs != CONTEXT:
-        learned, scored = (some.without_context() for some in (learned, scored))
+        learned, scored = (one.without_context() for one in (learned, scored))
     if job.inputs == DURATIONS:
         past = PastDurations.of(learned)
         learned, scored = past.added_to(learned), past.added_to(scored)
     seed = design.seed * 1000 + job.fold
     if job.kind in LAGS:
-        return _by_lag(job.kind, learned, scored, design, seed)
-    found: Arrays = {}
-    for name, how, prior in _fitted(job, learned, scored, design, seed):
+        return _score_lags(job.kind, learned, scored, design, seed)
+    arrays: Arrays = {}
+    for name, how, prior in _fit_models(job, learned, scored, design, seed):
         if isinstance(prior, Screening):
-            found[f"{name}/promise"] = np.array(prior.gain)
+            arrays[f"{name}/promise"] = np.array(prior.gain)
             continue
-        found |= {f"{name}/how": np.array(how), f"{name}/bits": action_bits(prior, scored).float().numpy()}
-    return found
+        arrays |= {f"{name}/how": np.array(how), f"{name}/bits": action_bits(prior, scored).float().numpy()}
+    return arrays
 
 
-def _fitted(
+def _fit_models(
     job: Job, learned: Plans, scored: Plans, design: Design, seed: int
 ) -> Iterator[tuple[str, str, Prior | Screening]]:
     """The name, the settings and the prior of each model of a job, or what it promised in place of the prior."""
@@ -189,7 +189,7 @@ def _fitted(
         yield kind, "", prior.fit(plans_for(prior, learned), generator=generator, **design.training)
 
 
-def _by_lag(kind: str, learned: Plans, scored: Plans, design: Design, seed: int) -> Arrays:
+def _score_lags(kind: str, learned: Plans, scored: Plans, design: Design, seed: int) -> Arrays:
     """The bits of the last actions of short pieces, with 0, 1, 2 and more of the actions before them known."""
     # At most half of what the median plan has, so that pieces stand anywhere in plans.
     halves = (int(plans.mask().sum(1).double().median()) // 2 for plans in (learned, scored))
@@ -208,7 +208,7 @@ def _by_lag(kind: str, learned: Plans, scored: Plans, design: Design, seed: int)
     if kind == "gru-lags":
         name, neural = "gru", GRUPrior(learned.num_actions, seed=seed, **sizes)
         neural.fit(divisible(short), generator=generator, batch_size=PIECES_A_STEP, **design.training)
-        scores = [_of_last(neural, held_out, known) for known in range(reach + 1)]
+        scores = [_score_last(neural, held_out, num_past) for num_past in range(reach + 1)]
     elif "context_size" in sizes:
         return {}  # features cannot be counted
     else:
@@ -228,12 +228,12 @@ def _chains(learned: Plans, held_out: Plans, reach: int, num_contexts: int | Non
             chain.fit(learned)
         except TooLargeError:
             break
-        scores.append(_of_last(chain, held_out, order))
+        scores.append(_score_last(chain, held_out, order))
     return scores
 
 
-def _of_last(prior: Prior, held_out: Plans, known: int) -> Score:
+def _score_last(prior: Prior, held_out: Plans, num_past: int) -> Score:
     """The bits of the last action of each piece, with so many before it known: the same actions whatever is known."""
     length = held_out.max_length
-    bits = action_bits(prior, replace(held_out.steps(length - known - 1), lengths=None))
+    bits = action_bits(prior, replace(held_out.steps(length - num_past - 1), lengths=None))
     return score_bits("", "", bits[:, -1:], replace(held_out.steps(length - 1), lengths=None))

@@ -43,11 +43,11 @@ from neuroprior.behaviour.reporting.part import LISTED, Part, without_verdict
 from neuroprior.behaviour.reporting.scores import Evaluation
 
 
-def individual_section(found: Evaluation) -> Part | None:
+def individual_section(evaluation: Evaluation) -> Part | None:
     """A row and a strip for each individual; None where there are fewer than two."""
-    plans, generator = found.plans, torch.Generator().manual_seed(0)
-    some = plans[plans.mask().sum(1) > 1].group
-    if some is None or len(some.unique()) < 2:
+    plans, generator = evaluation.plans, torch.Generator().manual_seed(0)
+    groups = plans[plans.mask().sum(1) > 1].group
+    if groups is None or len(groups.unique()) < 2:
         return None
     result = individuals(plans, generator)
     frame, budget = result.frame(), individual_budget(plans)
@@ -97,7 +97,7 @@ def individual_section(found: Evaluation) -> Part | None:
             )
         )
     most = frame.iloc[int(frame["distance"].argmax())]
-    p_value = found.transitions.p_value
+    p_value = evaluation.transitions.p_value
     sentence = (
         f"Individuals differ in their transitions ({p_words(p_value)}), most of all {most.individual}: its distance"
         f" from the others is {most.distance:.3f}, 95 % interval {most.low:.3f} to {most.high:.3f} ({most.differs_in})."
@@ -105,35 +105,35 @@ def individual_section(found: Evaluation) -> Part | None:
     estimate = (float(most.distance), float(most.low), float(most.high))
     starred = bool(enough and p_value < LEVEL)
     findings = [Finding("individuals", "individuals", "individuals", *estimate, p_value, p_value, starred, sentence)]
-    if found.transitions.test == "none":
+    if evaluation.transitions.test == "none":
         findings = []
     elif not starred:
         text.append(without_verdict(too_few(plans)) or f"That they differ was not found ({p_words(p_value)}).")
     if len(result.names) >= FEWEST_INDIVIDUALS:
-        own = individuality(plans)
-        frames |= {"individuality": own.frame(), "individuality_by_behaviour": own.behaviours()}
-        finding = _individuality_finding(own, enough)
+        gain = individuality(plans)
+        frames |= {"individuality": gain.frame(), "individuality_by_behaviour": gain.behaviours()}
+        finding = _individuality_finding(gain, enough)
         findings.append(finding)
         text.append(finding.sentence)
-        tables.append(_individuality_table(own))
+        tables.append(_individuality_table(gain))
     return Part(Section("Individuals", text, tables, boxes), frames, findings=findings)
 
 
-def _individuality_finding(own: Individuality, enough: bool) -> Finding:
-    saved, low, high, p_value = own.total
-    concentration = own.concentrations[-1]
+def _individuality_finding(gain: Individuality, enough: bool) -> Finding:
+    saved, low, high, p_value = gain.total
+    concentration = gain.concentrations[-1]
     after = f" (its own transitions count as much as those of all after {concentration:.0f} of them)"
     sentence = (
         f"Predictions that follow the individual save {saved:.4f} bits per behaviour, 95 % interval {low:.4f} to"
-        f" {high:.4f}: {100 * own.share:.2g} % of all that is predicted{after * (concentration < inf)};"
+        f" {high:.4f}: {100 * gain.share:.2g} % of all that is predicted{after * (concentration < inf)};"
         f" {p_words(p_value)}."
     )
     name, starred = "individuality", enough and p_value < LEVEL and saved > 0
     return Finding(name, name, name, saved, low, high, p_value, p_value, bool(starred), sentence)
 
 
-def _individuality_table(own: Individuality) -> Table:
-    rows = own.behaviours().sort_values("saved", ascending=False, kind="stable")
+def _individuality_table(gain: Individuality) -> Table:
+    rows = gain.behaviours().sort_values("saved", ascending=False, kind="stable")
     columns: dict[str, Column] = {
         "behaviour": "behaviour",
         "bouts": "bouts:,",
@@ -151,8 +151,8 @@ def individual_budget(plans: RecordedPlans) -> pd.DataFrame:
     """The share of each behaviour among the actions of each individual: a row an individual, a column a behaviour."""
     mask, size = plans.mask(), plans.num_actions
     assert plans.group is not None
-    own = plans.group.long()[:, None].expand(mask.shape)[mask]
-    present, rank = own.unique(return_inverse=True)
+    subject = plans.group.long()[:, None].expand(mask.shape)[mask]
+    present, rank = subject.unique(return_inverse=True)
     counts = (rank * size + plans.actions[mask].long()).bincount(minlength=len(present) * size).view(-1, size)
     shares = (counts / counts.sum(1, keepdim=True)).cpu().numpy()
     return pd.DataFrame(shares, index=group_names(plans, present), columns=action_names(plans))

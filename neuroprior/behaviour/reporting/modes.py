@@ -37,16 +37,16 @@ MOST_MOTIFS = 3
 """Sequences that are listed of each mode."""
 
 
-def mode_section(found: Evaluation) -> Part | None:
+def mode_section(evaluation: Evaluation) -> Part | None:
     """Hidden modes; None where no numbers of them are given."""
-    numbers = found.settings.get("modes")
+    numbers = evaluation.settings.get("modes")
     if not numbers:
         return None
-    plans = divided = found.plans
-    cut = bool(found.settings.get("cut"))
+    plans = divided = evaluation.plans
+    cut = bool(evaluation.settings.get("cut"))
     if cut:
         divided = in_parts(plans, min(BLOCKS, max(int(plans.mask().sum()) // 2, 1)))
-    mask = counted(divided, found.settings["skip"], cut)
+    mask = counted(divided, evaluation.settings["skip"], cut)
     choice = choose_modes(divided, numbers, mask=mask, generator=torch.Generator().manual_seed(0))
     prior, stable = choice.prior, choice.stable().tolist()
     tables, boxes, frames = [choice_table(choice)], list[FigureBox](), {"modes": choice.frame()}
@@ -82,22 +82,26 @@ def mode_section(found: Evaluation) -> Part | None:
     )
     align = "rlrrr" + "l" * (len(columns) - 5)
     tables.append(table(described, columns, caption, "What each mode does", align))
-    typical = _typical(prior, plans)
+    typical = _typical_sequences(prior, plans)
     if len(typical):
         shown: dict[str, Column] = {"mode": "mode", "sequence": "sequence", "count": "count:,", "ratio": "ratio:.2f"}
-        shown |= {} if found.too_few else {"p": lambda row: p_text(row["corrected"])}
+        shown |= {} if evaluation.too_few else {"p": lambda row: p_text(row["corrected"])}
         caption = "Within a mode, against a chain of order n - 2; ratio: times as often as expected."
-        caption += "" if found.too_few else " p: Fisher's exact test, corrected for all sequences of a mode (Holm)."
+        caption += (
+            "" if evaluation.too_few else " p: Fisher's exact test, corrected for all sequences of a mode (Holm)."
+        )
         tables.append(
             table(typical, shown, caption, "Over-represented sequences of each mode", "rl" + "r" * (len(shown) - 2))
         )
-    own = mode_plans(prior, plans)
+    path_plans = mode_plans(prior, plans)
     caption = "Each row a sequence, each colour the most probable mode."
     boxes.append(
-        FigureBox(figures.ethogram_figure(own), caption, "Modes as coloured strips over time.", "mode_ethogram")
+        FigureBox(figures.ethogram_figure(path_plans), caption, "Modes as coloured strips over time.", "mode_ethogram")
     )
     occupied = _occupancy(prior, plans)
-    caption = f"The share of the behaviours in each mode, by tenths of the sequences. 95 % intervals over {found.unit}."
+    caption = (
+        f"The share of the behaviours in each mode, by tenths of the sequences. 95 % intervals over {evaluation.unit}."
+    )
     boxes.append(
         FigureBox(figures.occupancy_figure(occupied), caption, "Shares of the modes over time.", "mode_occupancy")
     )
@@ -119,16 +123,18 @@ def mode_section(found: Evaluation) -> Part | None:
         "mode_actions": mode_frame(prior, plans),
     }
     findings: list[Finding] = []
-    if own.condition is not None:
-        part = condition_section(replace(found, plans=own))
-        assert part is not None
-        text.append(f"Modes by condition. {part.section.text[0]}")
-        tables += [replace(one, title=f"Modes: {one.title[:1].lower()}{one.title[1:]}") for one in part.section.tables]
-        boxes += [replace(box, name=f"mode_{box.name}") for box in part.section.figures]
-        frames |= {f"mode_{name}": frame for name, frame in part.frames.items()}
+    if path_plans.condition is not None:
+        by_condition = condition_section(replace(evaluation, plans=path_plans))
+        assert by_condition is not None
+        text.append(f"Modes by condition. {by_condition.section.text[0]}")
+        tables += [
+            replace(one, title=f"Modes: {one.title[:1].lower()}{one.title[1:]}") for one in by_condition.section.tables
+        ]
+        boxes += [replace(box, name=f"mode_{box.name}") for box in by_condition.section.figures]
+        frames |= {f"mode_{name}": frame for name, frame in by_condition.frames.items()}
         findings = [
             replace(one, id=f"modes: {one.id}", family=f"modes: {one.family}", feature=f"{one.feature} (modes)")
-            for one in part.findings
+            for one in by_condition.findings
         ]
     return Part(Section("Hidden modes", text, tables, boxes), frames, findings=findings)
 
@@ -150,7 +156,7 @@ def choice_table(choice: ModeChoice) -> Table:
     return table(choice.frame(), columns, caption, "Hidden modes", "rrrrrl")
 
 
-def _typical(prior: SwitchingPrior, plans: Plans) -> pd.DataFrame:
+def _typical_sequences(prior: SwitchingPrior, plans: Plans) -> pd.DataFrame:
     """The most over-represented sequences within each mode of the most probable path."""
     path, mask, names = mode_plans(prior, plans).actions, plans.mask(), action_names(plans)
     new = torch.ones_like(mask)
@@ -162,9 +168,9 @@ def _typical(prior: SwitchingPrior, plans: Plans) -> pd.DataFrame:
     group = plan if plans.group is None else plans.group[plan]
     every, mode, rows = Plans(runs, plans.num_actions, sizes, group=group), path[mask][start], []
     for k in range(prior.num_modes):
-        own = every[mode == k]
-        found = motifs(own) if len(own) else []
-        over = [one for one in found if one.ratio > 1 and one.corrected < LEVEL]
+        mode_runs = every[mode == k]
+        mode_motifs = motifs(mode_runs) if len(mode_runs) else []
+        over = [one for one in mode_motifs if one.ratio > 1 and one.corrected < LEVEL]
         for one in over[:MOST_MOTIFS]:
             sequence = " ".join(names[action] for action in one.actions)
             rows.append((k + 1, sequence, one.count, one.expected, one.ratio, one.corrected))

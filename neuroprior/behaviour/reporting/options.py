@@ -74,8 +74,8 @@ class ReadOptions(Options):
         if file is None or is_recording(file):
             return self.plans(read_recordings(files, self))
         of_plans = ("num_actions", "action_names")
-        if given := [name for name, value in DEFAULTS.items() if name not in of_plans and getattr(self, name) != value]:
-            raise ValueError(f"`{given[0]}` must be left out for {file}, whose kind holds plans and no recordings")
+        if names := [name for name, value in DEFAULTS.items() if name not in of_plans and getattr(self, name) != value]:
+            raise ValueError(f"`{names[0]}` must be left out for {file}, whose kind holds plans and no recordings")
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always", UserWarning)
             plans = _read_recorded(str(file), self.num_actions, self.action_names)

@@ -179,7 +179,7 @@ def write_page(
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
-        finalize=_printable,
+        finalize=_escape,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -209,7 +209,7 @@ def svg(figure: Figure) -> str:
     text = content.getvalue()
     # Its style sheet would hold for the whole page, and its metadata name addresses.
     text = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>", "", text[text.index("<svg") :], flags=re.DOTALL)
-    return _in_tags(_following, _sized(text)).strip()
+    return _change_tags(_follow_page, _fit_width(text)).strip()
 
 
 def clean(text: str) -> str:
@@ -222,16 +222,16 @@ def clean(text: str) -> str:
     )
 
 
-def _printable(value: Any) -> Any:
+def _escape(value: Any) -> Any:
     """What stands in the page for a value of the template; what is markup already stays as it is."""
     if isinstance(value, Markup):
         return value
     text = clean(", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value))
     parts = RIGHT_TO_LEFT.split(text)  # every second one is to be isolated
-    return Markup("").join(Markup("<bdi>{}</bdi>").format(part) if k % 2 else part for k, part in enumerate(parts))
+    return Markup("").join(Markup("<bdi>{}</bdi>").format(piece) if k % 2 else piece for k, piece in enumerate(parts))
 
 
-def _sized(text: str) -> str:
+def _fit_width(text: str) -> str:
     """The SVG as wide as the page has room for: at most its own width, and at least what keeps its text legible."""
     width = 4 / 3 * float(re.findall(r'<svg[^>]* width="([\d.]+)pt"', text)[0])
     letters = 4 / 3 * min(map(float, re.findall(r'<text style="[^"]*font-size: ([\d.]+)px', text)), default=SMALLEST)
@@ -240,7 +240,7 @@ def _sized(text: str) -> str:
     return text.replace("<svg ", f'<svg style="{style}" ', 1)
 
 
-def _following(tag: str) -> str:
+def _follow_page(tag: str) -> str:
     """A tag with the page's colours and font."""
     tag = tag.replace(INK, "currentColor").replace(PAPER, "var(--paper, #fff)")
     return tag.replace("font-family: 'DejaVu Sans', sans-serif", "font-family: inherit")
@@ -249,10 +249,10 @@ def _following(tag: str) -> str:
 def _drawing(box: FigureBox, prefix: str) -> Markup:
     """The SVG of a figure under ids of its own: matplotlib numbers those of every figure alike."""
     labelled = Markup('<svg role="img" aria-label="{}" ').format(clean(box.alt))
-    text = _in_tags(lambda tag: re.sub(r'( id="|href="#|url\(#)', rf"\g<1>{prefix}", tag), box.drawing)
+    text = _change_tags(lambda tag: re.sub(r'( id="|href="#|url\(#)', rf"\g<1>{prefix}", tag), box.drawing)
     return Markup(text.replace("<svg ", labelled, 1))
 
 
-def _in_tags(change: Any, text: str) -> str:
+def _change_tags(change: Any, text: str) -> str:
     """Change the tags of XML and leave the text between them, in which matplotlib escapes < and >."""
     return re.sub(r"<[^>]*>", lambda match: change(match[0]), text)

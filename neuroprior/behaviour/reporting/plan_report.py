@@ -107,8 +107,8 @@ def report(
     Example:
         >>> plans = Plans(torch.randint(3, (20, 30), generator=torch.Generator().manual_seed(0)).sort(1).values, 3)
         >>> fits = FitOptions(models=["counts"], folds=2, processes=1)
-        >>> found = report(plans, fits=fits, sections=["transitions"])
-        >>> list(found.figures)
+        >>> document = report(plans, fits=fits, sections=["transitions"])
+        >>> list(document.figures)
         ['transitions', 'transition_graph']
     """
     check_choices("sections", sections, tuple(SECTIONS))
@@ -128,18 +128,20 @@ def report(
         _check_other_files(files, test)
         stages = _cross_validate(plans, test, skip, fits, reading, out, "lags" in sections)
     else:
-        if given := fits.changed() + ["test"] * (test is not None):
-            names = ", ".join(f"`{name}`" for name in given)
+        if changed := fits.changed() + ["test"] * (test is not None):
+            names = ", ".join(f"`{name}`" for name in changed)
             raise ValueError(f"{names} must be left out where `priors` are given, which are not fitted.")
         stages = iter([_Stage(_score_saved(plans, priors, skip, reading), tuple(SECTIONS), "")])
     recordings = plans if isinstance(plans, Recordings) else None
-    made, document, written = dict[str, Part | None](), None, monotonic()
+    results, document, written = dict[str, Part | None](), None, monotonic()
     try:
         for stage in stages:
-            found = replace(stage.found, recordings=recordings)
+            evaluation = replace(stage.evaluation, recordings=recordings)
             if document is None or stage.sections:
-                made |= _made(found, [name for name in SECTIONS if name in sections and name in stage.sections])
-                document = _document(found, made, file, command, figures)
+                results |= _fill_sections(
+                    evaluation, [name for name in SECTIONS if name in sections and name in stage.sections]
+                )
+                document = _document(evaluation, results, file, command, figures)
             elif monotonic() - written < SECONDS_A_STATUS:
                 continue
             document, written = replace(document, status=stage.status), monotonic()
@@ -168,7 +170,7 @@ def _write(document: Document, folder: Path, figures: FigureKind | None) -> None
 class _Stage(NamedTuple):
     """What was found so far, the sections that can be made of it, and what is still to come."""
 
-    found: Evaluation
+    evaluation: Evaluation
     sections: Sequence[str]
     status: str
 
@@ -185,11 +187,13 @@ def _score_saved(
     table = isinstance(plans, Recordings) or (not isinstance(plans, Plans) and is_recording(plans))
     if table and reading.action_names is None:
         reading = replace(reading, action_names=learned_names(next(iter(loaded.values()))))
-    found = evaluate_saved(loaded, _read(plans, reading), skip, table, past)
-    known = {folder: sum(learned_from(Path(folder), found.plans)) for folder in folders}
-    if not any(known.values()):
-        return found
-    return replace(found, settings=found.settings | {"training data": {name: n for name, n in known.items() if n}})
+    evaluation = evaluate_saved(loaded, _read(plans, reading), skip, table, past)
+    learned = {folder: sum(learned_from(Path(folder), evaluation.plans)) for folder in folders}
+    if not any(learned.values()):
+        return evaluation
+    return replace(
+        evaluation, settings=evaluation.settings | {"training data": {name: n for name, n in learned.items() if n}}
+    )
 
 
 def _cross_validate(
@@ -207,15 +211,15 @@ def _cross_validate(
     """
     if test is not None and fits.folds is not None:
         raise ValueError("`folds` must be left out where there are `test` plans, for which nothing is held out.")
-    whole, empty = _with_actions(plans, reading)
+    whole, empty = _drop_empty_plans(plans, reading)
     other, cut = None, False
     if test is not None:
-        other, empty = _with_actions(test, reading)
-        other = _numbered_alike(whole, other, "test" if isinstance(test, Plans) else str(test))
+        other, empty = _drop_empty_plans(test, reading)
+        other = _number_alike(whole, other, "test" if isinstance(test, Plans) else str(test))
     whole, other = _contexts_from_0(whole, other)
-    learned, cut = _in_parts(whole)
+    learned, cut = _cut_single_plan(whole)
     if other is not None:
-        other, cut = _in_parts(other)
+        other, cut = _cut_single_plan(other)
     scored = learned if other is None else other
     number = 1 if other is not None else _folds(_name(plans), learned, fits)
     screened = fits.models is None and fits.effort != "full" and "durations" not in fits.inputs
@@ -241,29 +245,29 @@ def _cross_validate(
     counts, networks = ([job for job in todo if (job.kind in COUNTS) == first] for first in (True, False))
 
     def evaluated(done: list[Job]) -> Evaluation:
-        found = evaluate(learned, other, design, done, run.results(done))
+        evaluation = evaluate(learned, other, design, done, run.results(done))
         more: dict[str, Any] = {} if fits.modes is None else {"modes": sorted(set(fits.modes))}
         more |= {"sequences without behaviours, left out": empty} if empty else {}
         more |= {} if test is None else {"test": _name(test)}
         more |= {"training data": {"each model": again}} if again else {}
-        return replace(found, plans=whole, settings=settings | found.settings | more)
+        return replace(evaluation, plans=whole, settings=settings | evaluation.settings | more)
 
-    def fitting(some: list[Job]) -> Iterator[_Stage]:
-        counting = some and all(job.networks == () for job in some)  # takes less time than starting processes
+    def fitting(batch: list[Job]) -> Iterator[_Stage]:
+        counting = batch and all(job.networks == () for job in batch)  # takes less time than starting processes
         how: dict[str, Any] = {"processes": 1 if counting else fits.processes, "dask": fits.dask, "title": "networks"}
-        for seconds in run.each(some, cost=lambda job: COSTS[job.kind], **how):
-            yield _Stage(found, (), _still(f"networks (about {in_words(seconds)} more)", *later[1:]))
+        for seconds in run.each(batch, cost=lambda job: COSTS[job.kind], **how):
+            yield _Stage(evaluation, (), _status(f"networks (about {in_words(seconds)} more)", *later[1:]))
 
     with TemporaryDirectory() as temporary:
         run = cross_validation(Path(out or temporary), learned, other, design)
-        found, modes = evaluated([]), "" if fits.modes is None else "hidden modes"
+        evaluation, modes = evaluated([]), "" if fits.modes is None else "hidden modes"
         at_once = [name for name in SECTIONS if name not in (*OF_MODELS, "modes")]
         later = ["networks"] * bool(networks) + [modes] * bool(modes)
-        yield _Stage(found, at_once, _still("counts", *later))
+        yield _Stage(evaluation, at_once, _status("counts", *later))
         for _ in run.each(counts, processes=1, dask=fits.dask, title="counts"):
             pass
-        found = evaluated(counts)
-        yield _Stage(found, OF_MODELS, _still(*later))
+        evaluation = evaluated(counts)
+        yield _Stage(evaluation, OF_MODELS, _status(*later))
         if networks:
             # Screened, the first fold decides which networks are trained in the others.
             first = [job for job in networks if not screened or (job.kind == COMBINED and job.fold == 0)]
@@ -275,102 +279,103 @@ def _cross_validate(
                 if job not in first and (job.kind == COMBINED or trained[job.inputs])
             ]
             yield from fitting(others)
-            found = evaluated([*counts, *first, *others])
-            yield _Stage(found, (*OF_MODELS, *["durations"] * (DURATIONS in inputs)), _still(*later[1:]))
+            evaluation = evaluated([*counts, *first, *others])
+            yield _Stage(evaluation, (*OF_MODELS, *["durations"] * (DURATIONS in inputs)), _status(*later[1:]))
         if modes:
-            yield _Stage(found, ("modes",), "")
+            yield _Stage(evaluation, ("modes",), "")
 
 
-def _still(*later: str) -> str:
+def _status(*later: str) -> str:
     """What is still to come, as a sentence."""
     return f"Still running: {listed(later)}." if later else ""
 
 
 def _inputs(fits: FitOptions, kinds: Sequence[str], learned: RecordedPlans, scored: RecordedPlans) -> list[str]:
     """The inputs that plans have of those that are asked for."""
-    found = [ACTIONS] * ("actions" in fits.inputs)
-    found += [CONTEXT] * ("context" in fits.inputs and learned.context is not None)
+    inputs = [ACTIONS] * ("actions" in fits.inputs)
+    inputs += [CONTEXT] * ("context" in fits.inputs and learned.context is not None)
     if "durations" in fits.inputs:
         if learned.durations is None or scored.durations is None:
             raise ValueError("`inputs` must not hold durations where plans have none.")
         if not set(kinds) & set(OF_FEATURES):
             raise ValueError(f"`models` must hold one of {', '.join(OF_FEATURES)}, of which durations are an input.")
-        found.append(DURATIONS)
-    if not found:
+        inputs.append(DURATIONS)
+    if not inputs:
         raise ValueError("`inputs` must hold more than the context where plans have none.")
-    return found
+    return inputs
 
 
-def _made(found: Evaluation, names: Sequence[str]) -> dict[str, Part | None]:
+def _fill_sections(evaluation: Evaluation, names: Sequence[str]) -> dict[str, Part | None]:
     """These sections."""
-    made = {}
+    results = {}
     # Its steps are small: on a busy machine several threads would wait for one another.
     with Progress("report", len(names), len(names)) as progress, one_thread():
         for name in names:
-            made[name] = SECTIONS[name](found)
+            results[name] = SECTIONS[name](evaluation)
             progress.advance(name)
-    return made
+    return results
 
 
 def _document(
-    found: Evaluation, made: Mapping[str, Part | None], file: str, command: str, figures: FigureKind | None
+    evaluation: Evaluation, results: Mapping[str, Part | None], file: str, command: str, figures: FigureKind | None
 ) -> Document:
     """The sections that were made, in the order of the page, below what they found."""
-    parts = [part for name in SECTIONS if (part := made.get(name)) is not None]
-    findings = [finding for part in parts for finding in part.findings]
-    verdicts = [verdict for part in parts for verdict in part.verdicts]
+    shown = [result for name in SECTIONS if (result := results.get(name)) is not None]
+    findings = [finding for result in shown for finding in result.findings]
+    verdicts = [verdict for result in shown for verdict in result.verdicts]
     return Document(
         title=f"Report on {file}" if file else "Report",
         lead="",
-        sections=[replace(part.section, files=_files(part, figures)) for part in parts],
-        frames={name: frame for part in parts for name, frame in part.frames.items()},
-        settings=found.settings,
+        sections=[replace(result.section, files=_files(result, figures)) for result in shown],
+        frames={name: frame for result in shown for name, frame in result.frames.items()},
+        settings=evaluation.settings,
         command=command,
         results={
-            "reference": None if found.reference is None else found.reference[1],
-            "unit": found.unit,
-            "not_trained": dict(found.promises),
-            "file": {"name": file, **describe(found.plans)},
+            "reference": None if evaluation.reference is None else evaluation.reference[1],
+            "unit": evaluation.unit,
+            "not_trained": dict(evaluation.promises),
+            "file": {"name": file, **describe(evaluation.plans)},
             "findings": [finding.row() for finding in findings],
         },
-        graphs={name: graph for part in parts for name, graph in part.graphs.items()},
-        headline=headline([*verdicts, *_scored(found)], [part.findings for part in parts]),
+        graphs={name: graph for result in shown for name, graph in result.graphs.items()},
+        headline=headline([*verdicts, *_best_verdict(evaluation)], [result.findings for result in shown]),
     )
 
 
-def _files(part: Part, figures: FigureKind | None) -> list[str]:
+def _files(result: Part, figures: FigureKind | None) -> list[str]:
     """The files of a section's tables and figures."""
-    tables = [f"{name}.csv" for name, frame in part.frames.items() if len(frame)]
-    tables += [f"{name}.{ending}" for name in part.graphs for ending in ("graphml", "gv")]
-    return tables + [f"figures/{box.name}.{figures}" for box in part.section.figures if figures is not None]
+    tables = [f"{name}.csv" for name, frame in result.frames.items() if len(frame)]
+    tables += [f"{name}.{ending}" for name in result.graphs for ending in ("graphml", "gv")]
+    return tables + [f"figures/{box.name}.{figures}" for box in result.section.figures if figures is not None]
 
 
-def _scored(found: Evaluation) -> list[str]:
+def _best_verdict(evaluation: Evaluation) -> list[str]:
     """The model that takes the fewest bits, which is called the best where there are enough units."""
-    if not found.models:
+    if not evaluation.models:
         return []
-    learned = found.settings.get("training data", {})
+    learned = evaluation.settings.get("training data", {})
     same = "; ".join(
-        f"{name} has learned from {number:,} of the {len(found.scored):,} sequences" for name, number in learned.items()
+        f"{name} has learned from {number:,} of the {len(evaluation.scored):,} sequences"
+        for name, number in learned.items()
     )
-    return [f"{_best(found)} These are training data: {same}." if learned else _best(found)]
+    return [f"{_best(evaluation)} These are training data: {same}." if learned else _best(evaluation)]
 
 
-def _best(found: Evaluation) -> str:
-    bits, low, high, _ = found.best.score.bits_per_action()
-    interval = f"(95 % interval {low:.3f} to {high:.3f} over {found.unit})"
-    if not found.too_few:
-        return f"The best model, {found.best.label}, takes {bits:.3f} bits per behaviour {interval}."
-    fewest = "the fewest bits per behaviour of all models, " if len(found.models) > 1 else "bits per behaviour: "
-    return f"{found.best.label} takes {fewest}{bits:.3f} {interval}; {found.too_few}."
+def _best(evaluation: Evaluation) -> str:
+    bits, low, high, _ = evaluation.best.score.bits_per_action()
+    interval = f"(95 % interval {low:.3f} to {high:.3f} over {evaluation.unit})"
+    if not evaluation.too_few:
+        return f"The best model, {evaluation.best.label}, takes {bits:.3f} bits per behaviour {interval}."
+    fewest = "the fewest bits per behaviour of all models, " if len(evaluation.models) > 1 else "bits per behaviour: "
+    return f"{evaluation.best.label} takes {fewest}{bits:.3f} {interval}; {evaluation.too_few}."
 
 
 def _check_other_files(files: Plans | Recordings | Files, test: Plans | Recordings | Files | None) -> None:
     """Raise ValueError where the plans to score are those to learn from."""
     paths = [
         Path(one).resolve()
-        for some in (files, test)
-        for one in ([some] if isinstance(some, str | Path) else some if isinstance(some, list | tuple) else [])
+        for source in (files, test)
+        for one in ([source] if isinstance(source, str | Path) else source if isinstance(source, list | tuple) else [])
     ]
     if len(set(paths)) < len(paths):
         raise ValueError(f"`test` must be other plans than those that are learned from, got {test}.")
@@ -391,20 +396,20 @@ def _read(plans: Plans | Recordings | Files, reading: ReadOptions) -> RecordedPl
     return plans if plans.end is None else plans.without_end()
 
 
-def _with_actions(plans: Plans | Recordings | Files, reading: ReadOptions) -> tuple[RecordedPlans, int]:
+def _drop_empty_plans(plans: Plans | Recordings | Files, reading: ReadOptions) -> tuple[RecordedPlans, int]:
     """The plans that have actions, and how many have none: these are of no use to models."""
     read, file = _read(plans, reading), _name(plans)
     if read.num_actions > MOST_ACTIONS:
         raise ValueError(
             f"{file}: action numbers go up to {read.num_actions - 1}; number the actions from 0, or write names"
         )
-    some = read.mask().any(1)
-    if not bool(some.any()):
+    acted = read.mask().any(1)
+    if not bool(acted.any()):
         raise ValueError(f"{file}: no plan has an action")
-    return read[some], int((~some).sum())
+    return read[acted], int((~acted).sum())
 
 
-def _in_parts(plans: AnyPlans) -> tuple[AnyPlans, bool]:
+def _cut_single_plan(plans: AnyPlans) -> tuple[AnyPlans, bool]:
     """The plans, a single one cut into consecutive parts; and whether it was."""
     if len(plans) > 1:
         return plans, False
@@ -425,7 +430,7 @@ def _folds(name: str, plans: Plans, fits: FitOptions) -> int:
 
 def _contexts_from_0(plans: AnyPlans, test: AnyPlans | None) -> tuple[AnyPlans, AnyPlans | None]:
     """The plans with the contexts that occur numbered from 0, where they have no names: gaps make no model larger."""
-    contexts = [some.context for some in (plans, test) if some is not None and some.context is not None]
+    contexts = [one.context for one in (plans, test) if one is not None and one.context is not None]
     named = plans.context_names is not None or (test is not None and test.context_names is not None)
     if contexts and contexts[0].is_floating_point() and not contexts[0].shape[-1]:
         raise ValueError("`context` must have one feature at least, or be left out.")
@@ -438,7 +443,7 @@ def _contexts_from_0(plans: AnyPlans, test: AnyPlans | None) -> tuple[AnyPlans, 
     return replace(plans, context=new[0]), None if test is None else replace(test, context=new[-1])
 
 
-def _numbered_alike(plans: Plans, test: AnyPlans, name: str) -> AnyPlans:
+def _number_alike(plans: Plans, test: AnyPlans, name: str) -> AnyPlans:
     """The test plans with actions and contexts numbered as in those that are learned from."""
     of_plans, of_test = _kind_of_context(plans), _kind_of_context(test)
     if of_plans != of_test:

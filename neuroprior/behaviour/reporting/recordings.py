@@ -32,9 +32,9 @@ MOST_PANELS = 12
 """Behaviours that are drawn over time: those that take the most."""
 
 
-def recording_section(found: Evaluation) -> Part | None:
+def recording_section(evaluation: Evaluation) -> Part | None:
     """Return the time budget of the recordings, and the agreement of observers; None where no times are known."""
-    recordings = found.recordings
+    recordings = evaluation.recordings
     if recordings is None or recordings.events["stop"].isna().all():
         return None
     each, course = subject_budget(recordings), time_course(recordings)
@@ -80,8 +80,8 @@ def subject_budget(recordings: Recordings) -> pd.DataFrame:
     """Return the share of the watched time of each behaviour and subject: `condition, subject, behaviour, share`."""
     kept = recordings.of_one_observer()
     parts = []
-    for level, part in kept.by_level(_shown_factor(kept)):
-        shares = part.time_budget().rename_axis(index="subject", columns="behaviour")
+    for level, level_recordings in kept.by_level(_shown_factor(kept)):
+        shares = level_recordings.time_budget().rename_axis(index="subject", columns="behaviour")
         parts.append(shares.reset_index().melt("subject", value_name="share").assign(condition=level))
     whole = pd.concat(parts, ignore_index=True).dropna()
     return whole.reindex(columns=["condition", "subject", "behaviour", "share"])
@@ -120,9 +120,9 @@ def time_course(recordings: Recordings, bins: int = BINS) -> pd.DataFrame:
     done = pd.DataFrame(inside(events)).groupby([events["condition"], events["subject"], events["behaviour"]]).sum()
     rows = []
     for level in time.index.get_level_values(0).unique():
-        own, whole = done.loc[level], time.loc[level].where(lambda values: values > 0)
-        for behaviour in own.index.get_level_values("behaviour").unique():
-            shares = own.xs(behaviour, level="behaviour").reindex(whole.index, fill_value=0.0) / whole
+        spent, whole = done.loc[level], time.loc[level].where(lambda values: values > 0)
+        for behaviour in spent.index.get_level_values("behaviour").unique():
+            shares = spent.xs(behaviour, level="behaviour").reindex(whole.index, fill_value=0.0) / whole
             for place in range(bins):
                 values = shares[place].dropna().to_numpy()
                 if len(values):
@@ -154,8 +154,8 @@ def budget_figure(budget: pd.DataFrame, each: pd.DataFrame) -> Figure:
             of = (each["behaviour"] == behaviour) & (each["condition"] == level)
             dots = 100 * each.loc[of, "share"]
             axes.plot(dots, np.full(len(dots), place + shift), "o", ms=4.5, mew=0, alpha=0.5, color=hues[level])
-            own = budget[(budget["behaviour"] == behaviour) & (budget["condition"] == level)]
-            for row in own.itertuples():
+            rows = budget[(budget["behaviour"] == behaviour) & (budget["condition"] == level)]
+            for row in rows.itertuples():
                 axes.hlines(place + shift, 100 * row.low, 100 * row.high, color=hues[level], lw=2.2)
                 axes.plot(100 * row.share, place + shift, "|", ms=11, mew=2.4, color=INK)
     names_down(axes, [short(str(name), 24) for name in order])
@@ -182,10 +182,10 @@ def course_figure(course: pd.DataFrame) -> Figure:
     figure, cells = panels(down, across, (WIDTH, 1.7 * down + 0.6), sharex=True)
     for axes, behaviour in zip(cells, shown, strict=False):
         for level in levels:
-            own = course[(course["behaviour"] == behaviour) & (course["condition"] == level)]
-            own = own[own["subjects"] >= own["subjects"].max() / 2]
-            bounds = own[["share", "low", "high"]].clip(0, 1).mul(100)
-            rows = np.column_stack([own["time"], bounds])
+            curve = course[(course["behaviour"] == behaviour) & (course["condition"] == level)]
+            curve = curve[curve["subjects"] >= curve["subjects"].max() / 2]
+            bounds = curve[["share", "low", "high"]].clip(0, 1).mul(100)
+            rows = np.column_stack([curve["time"], bounds])
             band(axes, rows, hues[level], short(str(level), 20), "-")
         axes.set_title(short(str(behaviour), 24), fontsize=9)
         axes.set_ylim(bottom=0)

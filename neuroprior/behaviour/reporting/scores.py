@@ -152,7 +152,7 @@ def jobs(design: Design, kinds: Iterable[str], inputs: Iterable[str]) -> list[Jo
 
 
 def evaluate(
-    plans: RecordedPlans, test: RecordedPlans | None, design: Design, todo: Sequence[Job], found: list[Arrays]
+    plans: RecordedPlans, test: RecordedPlans | None, design: Design, todo: Sequence[Job], job_arrays: list[Arrays]
 ) -> Evaluation:
     """The results of finished jobs, put together."""
     scored = plans if test is None else test
@@ -160,7 +160,7 @@ def evaluate(
     held_out = [split(plans, test, design, fold)[1] for fold in range(design.folds)]
     models, gains, promises = [], [], dict[str, float]()
     results: dict[tuple[str, str], list[Arrays]] = {}
-    for job, arrays in zip(todo, found, strict=True):
+    for job, arrays in zip(todo, job_arrays, strict=True):
         results.setdefault((job.kind, job.inputs), []).append(arrays)
     for (kind, inputs), by_fold in results.items():
         if kind in LAGS:
@@ -172,11 +172,11 @@ def evaluate(
         for name in [key.removesuffix("/how") for key in by_fold[0] if key.endswith("/how")]:
             parts = [{key.removeprefix(f"{name}/"): array for key, array in arrays.items()} for arrays in by_fold]
             # A chain may be too large for its tables in some folds.
-            if all("how" in part for part in parts):
-                how = ", ".join(filter(None, dict.fromkeys(str(part["how"]) for part in parts)))
+            if all("how" in fold_arrays for fold_arrays in parts):
+                how = ", ".join(filter(None, dict.fromkeys(str(fold_arrays["how"]) for fold_arrays in parts)))
                 bits = torch.zeros(scored.actions.shape)
-                for index, part in zip(held_out, parts, strict=True):
-                    bits[index] = torch.from_numpy(part["bits"])
+                for index, fold_arrays in zip(held_out, parts, strict=True):
+                    bits[index] = torch.from_numpy(fold_arrays["bits"])
                 models.append(Model(name, inputs, how, bits, score_bits(name, inputs, bits, scored, mask)))
     models.sort(key=lambda model: ([*WITH].index(model.inputs), ORDERED.index(model.name)))
     best = min(models, key=lambda model: model.cost, default=None)
@@ -222,18 +222,20 @@ def evaluate_saved(
     """
     models, notes = [], list(plans.notes)
     for name, prior in priors.items():
-        given, said = with_contexts_of(prior, plans, is_table)
+        with_contexts, said = with_contexts_of(prior, plans, is_table)
         if plans.action_names and prior.action_names is None:
             said.append(numbered_note("actions", plans.action_names))
         notes += [f"{name}: {one}" for one in said]
-        own = match_plans(given, prior, name)
+        matched = match_plans(with_contexts, prior, name)
         inputs = CONTEXT if prior.takes_context else ACTIONS
         if past_durations is not None and name in past_durations:
-            own, inputs = past_durations[name].added_to(own), DURATIONS
-        mask = counted(own, skip)
+            matched, inputs = past_durations[name].added_to(matched), DURATIONS
+        mask = counted(matched, skip)
         try:
-            bits = action_bits(prior, own)
-            models.append(Model(name, inputs, type(prior).__name__, bits, score_bits(name, inputs, bits, own, mask)))
+            bits = action_bits(prior, matched)
+            models.append(
+                Model(name, inputs, type(prior).__name__, bits, score_bits(name, inputs, bits, matched, mask))
+            )
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error
     plans, mask = replace(plans, notes=notes), counted(plans, skip)

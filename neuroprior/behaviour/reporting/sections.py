@@ -35,9 +35,9 @@ LISTED_LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 20)
 BEGINNING = 5  # actions of a plan that do not count in drift
 
 
-def file_section(found: Evaluation) -> Part:
+def file_section(evaluation: Evaluation) -> Part:
     """What was read: how many plans of which kind, the commonest of their actions, and the plans over time."""
-    plans, frame = found.plans, behaviour_frame(found.plans)
+    plans, frame = evaluation.plans, behaviour_frame(evaluation.plans)
     columns = {"sequences": "sequences:,", "behaviours": "behaviours:,", "shortest": "shortest", "longest": "longest"}
     columns |= {"kinds": "kinds", "subjects": "subjects", "context": "context"}
     columns |= {"conditions": "conditions"} if plans.condition is not None else {}
@@ -70,8 +70,8 @@ def behaviour_frame(plans: RecordedPlans) -> pd.DataFrame:
     plan = mask.nonzero()[:, 0]
     data = {"behaviour": plans.actions[mask].tolist(), "sequence": plan.tolist()}
     data["duration"] = [None] * len(plan) if plans.durations is None else plans.durations[mask].tolist()
-    found = pd.DataFrame(data).astype({"duration": "float64"}).groupby("behaviour")
-    frame = found.agg(
+    groups = pd.DataFrame(data).astype({"duration": "float64"}).groupby("behaviour")
+    frame = groups.agg(
         count=("sequence", "size"), sequences=("sequence", "nunique"), median_duration=("duration", "median")
     )
     names = action_names(plans)
@@ -103,13 +103,13 @@ def describe(plans: RecordedPlans) -> dict[str, Any]:
     }
 
 
-def score_section(found: Evaluation) -> Part | None:
+def score_section(evaluation: Evaluation) -> Part | None:
     """The main table; None where no model was scored yet."""
-    if found.reference is None:
+    if evaluation.reference is None:
         return None
-    scores = found.table()
+    scores = evaluation.table()
     more = scores["more_high"] - scores["more"]
-    learned, saved = found.settings.get("training data", {}), "priors" in found.settings
+    learned, saved = evaluation.settings.get("training data", {}), "priors" in evaluation.settings
     columns: Mapping[str, Column] = {
         "model": lambda row: f"{row.model} (training data)" if row.model in learned else str(row.model),
         **({"input": _input} if scores["input"].nunique() > 1 else {}),
@@ -119,14 +119,14 @@ def score_section(found: Evaluation) -> Part | None:
         "more bits": lambda row: "" if pd.isna(row.more) else f"{row.more:+.4f}±{more[row.name]:.4f}",
     }
     caption = (
-        f"{'' if saved else 'On held-out behaviours. '}±: 95 % intervals over {found.unit}. more bits: the difference"
-        f" from {found.reference[1]}, paired."
+        f"{'' if saved else 'On held-out behaviours. '}±: 95 % intervals over {evaluation.unit}. more bits: the"
+        f" difference from {evaluation.reference[1]}, paired."
     )
-    never = never_taken(found.plans) if any(model.name == "uniform" for model in found.models) else ""
+    never = never_taken(evaluation.plans) if any(model.name == "uniform" for model in evaluation.models) else ""
     caption += f" {never[:1].upper()}{never[1:]}." if never else ""
     if learned:
         same = "; ".join(
-            f"{number:,} of {len(found.scored):,} sequences for {name}" for name, number in learned.items()
+            f"{number:,} of {len(evaluation.scored):,} sequences for {name}" for name, number in learned.items()
         )
         caption += f" Training data: sequences that the prior has learned from, at least in part ({same})."
     held_out = "" if saved else " for behaviours that it has not learned from"
@@ -138,10 +138,10 @@ def score_section(found: Evaluation) -> Part | None:
         " corrected for the number of models.",
     ]
     text = text[:1] if saved else text
-    text += _not_trained(found)
-    text.append(without_verdict(found.too_few) or "A difference whose interval holds 0 is not significant.")
-    caption_of_figure = f"Bits per {'' if saved else 'held-out '}behaviour, 95 % intervals over {found.unit}."
-    best = found.best
+    text += _untrained(evaluation)
+    text.append(without_verdict(evaluation.too_few) or "A difference whose interval holds 0 is not significant.")
+    caption_of_figure = f"Bits per {'' if saved else 'held-out '}behaviour, 95 % intervals over {evaluation.unit}."
+    best = evaluation.best
     alt = f"Bits per behaviour of each model, the fewest {best.cost:.3f} of {best.label}."
     box = FigureBox(figures.score_figure(scores), caption_of_figure, alt, "scores")
     title = "Scores" if saved else "Held-out scores"
@@ -149,11 +149,11 @@ def score_section(found: Evaluation) -> Part | None:
     return Part(Section(title, text, [shown], [box]), {"scores": scores})
 
 
-def _not_trained(found: Evaluation) -> list[str]:
+def _untrained(evaluation: Evaluation) -> list[str]:
     """Sentences on the networks that promised too little to be trained."""
-    if not found.promises:
+    if not evaluation.promises:
         return []
-    names = listed([f"{name.replace(',', '')} ({max(bits, 0):.4f})" for name, bits in found.promises.items()])
+    names = listed([f"{name.replace(',', '')} ({max(bits, 0):.4f})" for name, bits in evaluation.promises.items()])
     return [
         "Networks are trained where a tenth of their training, in the first fold, promises enough to be kept. Not"
         f" trained, with the bits per behaviour that they promised at most: {names}. After the first that promises too"
@@ -161,15 +161,15 @@ def _not_trained(found: Evaluation) -> list[str]:
     ]
 
 
-def lag_section(found: Evaluation) -> Part | None:
+def lag_section(evaluation: Evaluation) -> Part | None:
     """How far back structure reaches."""
     try:
-        result = how_far_back(found.plans, skip=found.settings["skip"])
+        result = how_far_back(evaluation.plans, skip=evaluation.settings["skip"])
     except ValueError:  # fewer than two plans with successive actions
         result = None
-    if result is None and not len(found.gains):
+    if result is None and not len(evaluation.gains):
         return None
-    frames, tables, boxes = {"how_far_back": pd.DataFrame(), "lags": found.gains}, list[Table](), list[FigureBox]()
+    frames, tables, boxes = {"how_far_back": pd.DataFrame(), "lags": evaluation.gains}, list[Table](), list[FigureBox]()
     text = [
         "Gain: how much the behaviour k steps back improves predictions beyond all nearer ones. A Markov chain that"
         " knows k behaviours is compared with one that knows k - 1, on behaviours of those whose others it learned"
@@ -194,9 +194,11 @@ def lag_section(found: Evaluation) -> Part | None:
         }
         caption = f"Bits that the behaviour k steps back adds, over {result.unit}."
         caption += "" if result.few else " p: corrected for the lags. *: p < 0.05."
-        tables.append(table(frame, _without_p(columns, result.few), caption, "How far back"))
-    if len(found.gains):
-        lags = found.gains.assign(curve=figures.lag_names(found.gains), cell=found.gains["bits"].map("{:.4f}".format))
+        tables.append(table(frame, _drop_p(columns, result.few), caption, "How far back"))
+    if len(evaluation.gains):
+        lags = evaluation.gains.assign(
+            curve=figures.lag_names(evaluation.gains), cell=evaluation.gains["bits"].map("{:.4f}".format)
+        )
         wide = lags.pivot(index="lag", columns="curve", values="cell")[lags["curve"].unique()]
         wide = wide[wide.index.isin(LISTED_LAGS)].reset_index()
         names = {name.replace(", ", "\n").replace("with context", "+ context"): name for name in wide.columns}
@@ -207,15 +209,15 @@ def lag_section(found: Evaluation) -> Part | None:
             " adds."
         )
         tables.append(table(wide, names, "Bits. Not tested: one fold is too little.", "Gain by lag"))
-        over = f"intervals over {unit_name(found.first_fold)} of one fold"
+        over = f"intervals over {unit_name(evaluation.first_fold)} of one fold"
         caption = f"Bits that the behaviour k steps back adds; {over}."
-        boxes = [FigureBox(figures.lag_figure(found.gains), caption, "Gain by lag.", "lags")]
+        boxes = [FigureBox(figures.lag_figure(evaluation.gains), caption, "Gain by lag.", "lags")]
     return Part(Section("How far back", text, tables, boxes), frames, verdicts, findings)
 
 
-def motif_section(found: Evaluation) -> Part | None:
+def motif_section(evaluation: Evaluation) -> Part | None:
     """Over-represented sequences."""
-    plans, names = found.plans, action_names(found.plans)
+    plans, names = evaluation.plans, action_names(evaluation.plans)
     frame = pd.DataFrame(
         {"sequence": " ".join(names[action] for action in one.actions)}
         | {key: value for key, value in asdict(one).items() if key != "actions"}
@@ -243,29 +245,29 @@ def motif_section(found: Evaluation) -> Part | None:
     if len(frame):
         p = "Listed by" if few else "p:"
         caption = f"Against a chain of order n - 2. {p} Fisher's exact test, corrected for all (Holm)."
-        tables = [table(frame, _without_p(columns, few), caption)]
+        tables = [table(frame, _drop_p(columns, few), caption)]
         alt = "Over-represented sequences: " + "; ".join(frame["sequence"][:5])
         boxes = [FigureBox(figures.motif_figure(frame), "Times as often as expected.", alt, "motifs")]
     return Part(Section("Over-represented sequences", text, tables, boxes, folded=True), {"motifs": frame})
 
 
-def drift_section(found: Evaluation) -> Part | None:
+def drift_section(evaluation: Evaluation) -> Part | None:
     """Whether plans get easier or harder to predict, within and between them."""
     # The best model whose bits are those of the plans' own actions; of one that predicts ends, too, there are more.
-    ranked = sorted(found.models, key=lambda model: model.cost)
-    model = next((one for one in ranked if one.bits.shape == found.scored.actions.shape), None)
-    if model is None or int(found.mask.sum(1).max()) < 2:
+    ranked = sorted(evaluation.models, key=lambda model: model.cost)
+    model = next((one for one in ranked if one.bits.shape == evaluation.scored.actions.shape), None)
+    if model is None or int(evaluation.mask.sum(1).max()) < 2:
         return None
-    mask = _without_beginnings(found)
-    given = found.scored, model.bits, mask
-    within, plans, groups = by_position(*given), by_plan(*given), by_group(*given)
+    mask = _late_actions(evaluation)
+    scored = evaluation.scored, model.bits, mask
+    within, plans, groups = by_position(*scored), by_plan(*scored), by_group(*scored)
     numbers = list(groups.groups)
-    names = dict(zip(numbers, group_names(found.scored, torch.tensor(numbers)), strict=True))
+    names = dict(zip(numbers, group_names(evaluation.scored, torch.tensor(numbers)), strict=True))
     rows = [("place", f"part {n} of {len(within.parts)}", *one) for n, one in enumerate(within.parts, 1)]
     rows += [("subject", names[number], *one) for number, one in groups.groups.items()]
     drift = pd.DataFrame(rows, columns=["what", "name", "bits", "low", "high"])
-    own = pd.DataFrame({"group": plans.group.tolist(), "bits": plans.bits.tolist()})
-    own = own.assign(index=own.groupby("group").cumcount() + 1)
+    by_sequence = pd.DataFrame({"group": plans.group.tolist(), "bits": plans.bits.tolist()})
+    by_sequence = by_sequence.assign(index=by_sequence.groupby("group").cumcount() + 1)
     tests: list[dict[str, Any]] = [{"test": "change over a sequence, bits"} | within.trend._asdict()]
     if plans.trend is not None:
         tests.append({"test": f"rank correlation from {plans.item[:-1]} to {plans.item[:-1]}"} | plans.trend._asdict())
@@ -277,12 +279,12 @@ def drift_section(found: Evaluation) -> Part | None:
         " predict.",
         (
             f"The first {BEGINNING} behaviours of each sequence do not count here: little stands before them."
-            if mask is not found.mask
+            if mask is not evaluation.mask
             else "Sequences are too short to leave out their first behaviours. Little stands before these, so that they"
             " cost more, which alone is a change over a sequence."
         ),
-        *(["The only sequence was cut into parts, which stand for sequences."] * bool(found.settings.get("cut"))),
-        *([without_verdict(found.too_few)] if found.too_few else []),
+        *(["The only sequence was cut into parts, which stand for sequences."] * bool(evaluation.settings.get("cut"))),
+        *([without_verdict(evaluation.too_few)] if evaluation.too_few else []),
     ]
     columns: Mapping[str, Column] = {
         "test": "test",
@@ -290,35 +292,37 @@ def drift_section(found: Evaluation) -> Part | None:
         "95 % interval": lambda row: "" if pd.isna(row["mean"]) else f"{row.low:+.3f} to {row.high:+.3f}",
         "p": "p_value:.2g",
     }
-    caption = f"Bits of {model.label}; intervals over {found.unit}."
-    tables = [table(tests_frame, _without_p(columns, found.too_few), caption)]
-    caption = f"Bits per behaviour of {model.label}. Intervals (95 %) over {found.unit}; of subjects, over sequences."
+    caption = f"Bits of {model.label}; intervals over {evaluation.unit}."
+    tables = [table(tests_frame, _drop_p(columns, evaluation.too_few), caption)]
+    caption = (
+        f"Bits per behaviour of {model.label}. Intervals (95 %) over {evaluation.unit}; of subjects, over sequences."
+    )
     alt = "Bits per behaviour by place, sequence and subject."
-    box = FigureBox(figures.drift_figure(drift, own), caption, alt, "drift")
+    box = FigureBox(figures.drift_figure(drift, by_sequence), caption, alt, "drift")
     frames = {"drift": drift, "drift_tests": tests_frame, "rate_drift": pd.DataFrame()}
     with suppress(ValueError):  # a single recording
-        rates = _rates(found)
+        rates = _rates(evaluation)
         frames["rate_drift"] = rates
-        tables.append(_rate_table(rates, found))
+        tables.append(_rate_table(rates, evaluation))
         return Part(Section("Drift", text, tables, [box]), frames, findings=_rate_findings(rates))
     return Part(Section("Drift", text, tables, [box]), frames)
 
 
-def _without_beginnings(found: Evaluation) -> Tensor:
+def _late_actions(evaluation: Evaluation) -> Tensor:
     """The held-out actions that have a history, bool `[N, L]`; all of them where these are less than half."""
-    late = found.mask.clone()
+    late = evaluation.mask.clone()
     late[:, :BEGINNING] = False
-    enough = 2 * int(late.sum()) >= int(found.mask.sum())
-    return late if enough and len(units(found.scored, late)[late].unique()) > 1 else found.mask
+    enough = 2 * int(late.sum()) >= int(evaluation.mask.sum())
+    return late if enough and len(units(evaluation.scored, late)[late].unique()) > 1 else evaluation.mask
 
 
-def _rates(found: Evaluation) -> pd.DataFrame:
+def _rates(evaluation: Evaluation) -> pd.DataFrame:
     """How the rate of each behaviour changes, starred where it does; by watched time, too, where that is known."""
-    timed = found.recordings is not None and found.recordings.events["start"].notna().any()
-    source = found.recordings if timed and found.recordings is not None else found.plans
+    timed = evaluation.recordings is not None and evaluation.recordings.events["start"].notna().any()
+    source = evaluation.recordings if timed and evaluation.recordings is not None else evaluation.plans
     result = rate_drift(source)
     frame = result.frame()
-    starred = (frame["corrected"] < LEVEL) & (result.num_units >= ENOUGH_UNITS) & (not too_few(found.plans))
+    starred = (frame["corrected"] < LEVEL) & (result.num_units >= ENOUGH_UNITS) & (not too_few(evaluation.plans))
     if timed:
         columns = {"times": "by_time", "low": "by_time_low", "high": "by_time_high"}
         by_time = rate_drift(source, "time").frame().rename(columns=columns)
@@ -326,7 +330,7 @@ def _rates(found: Evaluation) -> pd.DataFrame:
     return frame.assign(unit=result.unit, starred=starred)
 
 
-def _rate_table(rates: pd.DataFrame, found: Evaluation) -> Table:
+def _rate_table(rates: pd.DataFrame, evaluation: Evaluation) -> Table:
     columns: dict[str, Column] = {
         "behaviour": "behaviour",
         "bouts": "bouts:,",
@@ -338,17 +342,17 @@ def _rate_table(rates: pd.DataFrame, found: Evaluation) -> Table:
         f"Share of all bouts at the end of a recording, divided by that at its beginning; intervals over"
         f" {rates['unit'].iloc[0]}."
     )
-    caption += "" if found.too_few else " p: corrected (Holm). *: p < 0.05."
+    caption += "" if evaluation.too_few else " p: corrected (Holm). *: p < 0.05."
     if "by_time" in rates:
         caption += " By watched time: the same of the number of bouts by time."
         columns["by watched time"] = lambda row: (
             "" if pd.isna(row.by_time) else f"{row.by_time:.3g} ({row.by_time_low:.3g} to {row.by_time_high:.3g})"
         )
-    return table(rates[:LISTED], _without_p(columns, found.too_few), caption, "Change of each behaviour")
+    return table(rates[:LISTED], _drop_p(columns, evaluation.too_few), caption, "Change of each behaviour")
 
 
 def _rate_findings(rates: pd.DataFrame) -> list[Finding]:
-    found = []
+    findings = []
     for row in rates.to_dict("records"):
         name, times, low, high, corrected = (row[what] for what in ("behaviour", "times", "low", "high", "corrected"))
         sentence = (
@@ -357,8 +361,8 @@ def _rate_findings(rates: pd.DataFrame) -> list[Finding]:
         )
         estimate = (times, low, high, float(row["p_value"]), float(corrected))
         feature, starred = f"drift of {name}", bool(row["starred"])
-        found.append(Finding(f"drift: {name}", "drift", feature, *estimate, starred, sentence))
-    return found
+        findings.append(Finding(f"drift: {name}", "drift", feature, *estimate, starred, sentence))
+    return findings
 
 
 SECTIONS: dict[str, Callable[[Evaluation], Part | None]] = {
@@ -381,7 +385,7 @@ OF_MODELS = ("scores", "lags", "drift")
 """Sections that say more with each model; durations do where models take these as an input."""
 
 
-def _without_p(columns: Mapping[str, Column], few: str) -> Mapping[str, Column]:
+def _drop_p(columns: Mapping[str, Column], few: str) -> Mapping[str, Column]:
     """The columns of a table, without p-values where there are too few independent units."""
     return {name: column for name, column in columns.items() if name != "p" or not few}
 

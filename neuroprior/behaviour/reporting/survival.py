@@ -38,7 +38,7 @@ def survival_findings(result: DurationSurvival, few: str, unit: str) -> list[Fin
         few: why no verdict is drawn; "" where one is.
         unit: of the durations.
     """
-    found = []
+    findings = []
     for name, (p, corrected) in result.tests.items():
         curves = {level: curve for (behaviour, level), curve in result.curves.items() if behaviour == name}
         effect, low, high = result.ratios.get(name, (None, None, None))
@@ -52,8 +52,8 @@ def survival_findings(result: DurationSurvival, few: str, unit: str) -> list[Fin
         sentence += f"; log-rank test, {p_words(corrected)}."
         feature, starred = f"survival of {name}", corrected < LEVEL and not few
         estimate = (effect, low, high, p, corrected)
-        found.append(Finding(f"survival: {name}", "survival", feature, *estimate, starred, sentence))
-    return found
+        findings.append(Finding(f"survival: {name}", "survival", feature, *estimate, starred, sentence))
+    return findings
 
 
 def survival_table(result: DurationSurvival, few: str) -> Table:
@@ -91,8 +91,8 @@ def survival_figure(survival: pd.DataFrame) -> Figure:
     figure, cells = panels(down, across, (WIDTH, 1.8 * down + 0.6))
     for axes, behaviour in zip(cells, shown, strict=False):
         for level in levels:
-            own = survival[(survival["behaviour"] == behaviour) & (survival["condition"] == level)]
-            time, share, low, high = floats(own[["time", "survival", "low", "high"]].to_numpy()).reshape(-1, 4).T
+            curve = survival[(survival["behaviour"] == behaviour) & (survival["condition"] == level)]
+            time, share, low, high = floats(curve[["time", "survival", "low", "high"]].to_numpy()).reshape(-1, 4).T
             axes.step(time, share, where="post", color=hues[level], lw=1.6)
             axes.fill_between(time, low, high, step="post", color=hues[level], alpha=0.2, lw=0)
         axes.set_title(short(str(behaviour), 24), fontsize=9)

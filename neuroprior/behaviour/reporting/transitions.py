@@ -19,12 +19,12 @@ MOST_NODES = 20
 """Actions up to which the graph of transitions is drawn."""
 
 
-def transition_section(found: Evaluation) -> Part | None:
+def transition_section(evaluation: Evaluation) -> Part | None:
     """Transition probabilities, overall and under each condition, and a test of whether groups have the same."""
-    plans = found.plans
+    plans = evaluation.plans
     if int(plans.mask().sum(1).max()) < 2:
         return None
-    result, few = found.transitions, too_few(plans)
+    result, few = evaluation.transitions, too_few(plans)
     names, probs = result.action_names, result.probs()
     frame = result.frame()
     frames = {"transitions": frame, "transition_test": pd.DataFrame()}

@@ -229,7 +229,7 @@ def test_empty_and_short_plans_to_choose_on_are_no_obstacle(tmp_path):
 def test_each_job_takes_one_thread(tmp_path, monkeypatch):
     """The number of threads changes sums in their last digits: results must not depend on who does a job."""
     threads, counts = torch.get_num_threads(), []
-    monkeypatch.setattr(fits, "_fitted", lambda *_: counts.append(torch.get_num_threads()) or ())
+    monkeypatch.setattr(fits, "_fit_models", lambda *_: counts.append(torch.get_num_threads()) or ())
     torch.set_num_threads(2)
     try:
         cross_validation(tmp_path, chain(), None, Design(2)).do([Job(0, "counts", ACTIONS)], processes=1)
@@ -244,7 +244,7 @@ def test_a_job_that_fails_leaves_nothing(tmp_path, monkeypatch):
     run, todo, right = (
         cross_validation(tmp_path, plans, None, design),
         jobs(design, ["counts"], [ACTIONS]),
-        fits._fitted,
+        fits._fit_models,
     )
 
     def fails_later(kind, learned, scored, design, seed):
@@ -252,7 +252,7 @@ def test_a_job_that_fails_leaves_nothing(tmp_path, monkeypatch):
             raise ValueError("no such plans")
         return right(kind, learned, scored, design, seed)
 
-    monkeypatch.setattr(fits, "_fitted", fails_later)
+    monkeypatch.setattr(fits, "_fit_models", fails_later)
     with refuses("no such plans"):
         run.do(todo, processes=1)
     assert [run.finished(job) for job in todo] == [True, False, False]
