@@ -28,13 +28,13 @@ def finished_runs(folder: str, settings: Settings, runs: Sequence[Run]) -> list[
         ValueError: the folder does not have them all, or has them several times (other priors, or another version of
             the code); or one is damaged.
     """
-    asked = _where({"command": "compare"} | settings.asked)
+    asked = _fixed_settings({"command": "compare"} | settings.asked)
     places = [path.parent for at in ("asked.json", "runs/*/asked.json") for path in sorted(Path(folder).glob(at))]
-    known = [place for place in places if _where(read_json(place / "asked.json")) == asked]
-    if not known:
+    matching = [place for place in places if _fixed_settings(read_json(place / "asked.json")) == asked]
+    if not matching:
         raise ValueError(f"beside: {folder} has no comparison of the same settings (but for kinds, priors and context)")
-    missing = {place: [run for run in runs if not (place / f"{run.name}.json").exists()] for place in known}
-    whole = [place for place in known if not missing[place]]
+    missing = {place: [run for run in runs if not (place / f"{run.name}.json").exists()] for place in matching}
+    whole = [place for place in matching if not missing[place]]
     if len(whole) > 1:
         several = " or ".join(map(str, whole))
         raise ValueError(f"beside: {folder} has {len(whole)} comparisons of these settings; give {several}")
@@ -46,7 +46,7 @@ def finished_runs(folder: str, settings: Settings, runs: Sequence[Run]) -> list[
     return [read_run(whole[0] / f"{run.name}.json") for run in runs]
 
 
-def _where(asked: Any) -> Any:
+def _fixed_settings(asked: Any) -> Any:
     """What was asked, as JSON has it, but for what may differ."""
     if not isinstance(asked, Mapping):
         return None
@@ -59,24 +59,24 @@ def put_beside(results: Sequence[Result], others: Sequence[Result]) -> list[dict
     Raises:
         ValueError: random plans reach something else in the others: these did not plan from the same starts.
     """
-    return [_with(mine, other) for mine, other in zip(results, others, strict=True)]
+    return [_merge(mine, other) for mine, other in zip(results, others, strict=True)]
 
 
-def _with(mine: Result, other: Result) -> dict[str, Any]:
+def _merge(mine: Result, other: Result) -> dict[str, Any]:
     if _starts(mine) != _starts(other):
         where = f"{mine['world']}, seed {mine['seed']}"
         raise ValueError(f"beside: {where}: random plans do not reach the same; the worlds or starts were others")
     return dict(mine) | {
-        "entries": _joined(mine["entries"], other["entries"], ("planner", *PRIOR)),
-        "curriculum": _joined(mine["curriculum"], other["curriculum"], PRIOR[:2]),
+        "entries": _join_rows(mine["entries"], other["entries"], ("planner", *PRIOR)),
+        "curriculum": _join_rows(mine["curriculum"], other["curriculum"], PRIOR[:2]),
         "transitions": other.get("transitions", {}) | mine.get("transitions", {}),
     }
 
 
-def _joined(mine: Sequence[Result], others: Sequence[Result], by: Sequence[str]) -> list[Result]:
+def _join_rows(mine: Sequence[Result], others: Sequence[Result], by: Sequence[str]) -> list[Result]:
     """Rows, and those of others that differ from all of them in `by`."""
-    known = {tuple(row[name] for name in by) for row in mine}
-    return [*mine, *(row for row in others if tuple(row[name] for name in by) not in known)]
+    my_keys = {tuple(row[name] for name in by) for row in mine}
+    return [*mine, *(row for row in others if tuple(row[name] for name in by) not in my_keys)]
 
 
 def _starts(result: Result) -> Any:

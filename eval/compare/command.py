@@ -103,7 +103,7 @@ def compare(
         raise ValueError("`kinds` must have at least one prior, unless there are --priors")
     check_distinct(worlds=worlds, num_plans=num_plans)
     more = {"priors": saved, "kinds": fitted, "context": tuple(context or ())}
-    check_distinct(**{name: given for name, given in more.items() if given})
+    check_distinct(**{name: values for name, values in more.items() if values})
     check_contexts(worlds, context or ())
     check_saved(saved, worlds)
     how = (tuple(num_plans), fitted, tuple(context or ()), rounds, steps, starts, training_starts, seed, saved)

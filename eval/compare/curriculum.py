@@ -85,14 +85,16 @@ def curriculum_document(results: Sequence[Mapping[str, Any]], settings: Mapping[
     gains = runs.seed_means(pairs.assign(gain=pairs["first"] - pairs["second"]), [*PRIOR, "length", "rounds"], "gain")
     tables: list[Table] = []
     boxes = []
-    for world, own in rows.groupby("world", sort=False):
-        tables += curriculum_tables(own)
-        if len(here := gaps[gaps["world"] == world]):
-            above = f"{world}: after the last round minus before the first, plans of {own['length'].max()} actions"
-            tables.append(runs.difference_table(here, above, NAMES, "normalised score, % of the optimum", 100))
-        caption = f"{world}: {own['num_plans'].iloc[0]:,} candidates for each start; bands: 95 % intervals over seeds."
+    for world, scores in rows.groupby("world", sort=False):
+        tables += curriculum_tables(scores)
+        if len(world_gaps := gaps[gaps["world"] == world]):
+            above = f"{world}: after the last round minus before the first, plans of {scores['length'].max()} actions"
+            tables.append(runs.difference_table(world_gaps, above, NAMES, "normalised score, % of the optimum", 100))
+        caption = (
+            f"{world}: {scores['num_plans'].iloc[0]:,} candidates for each start; bands: 95 % intervals over seeds."
+        )
         alt = f"Normalised score in {world} against rounds and actions in a plan; the numbers are in the tables."
-        boxes.append(FigureBox(score_panels(list(views(own)), 3.4), caption, alt))
+        boxes.append(FigureBox(score_panels(list(views(scores)), 3.4), caption, alt))
     if len(across):
         unit = "the normalised score of the longest plans, % of the optimum"
         tables.append(runs.across_table(across, NAMES, "after", "before", unit, 100))
@@ -127,11 +129,11 @@ def views(rows: pd.DataFrame) -> Iterator[View]:
     """Of one world's rows those with the longest plans, by round, and those after the last round, by length."""
     names = [f"{prior}, {context}".removesuffix(", none") for prior, context in rows[PRIOR[1:]].to_numpy()]
     rows, longest, last = rows.assign(name=names), rows["length"].max(), rows["round"].max()
-    for title, own, across, label in (
+    for title, panel_rows, across, label in (
         (f"plans of {longest} actions", rows[rows["length"] == longest], "round", "rounds of the curriculum"),
         (f"after {last} rounds", rows[rows["round"] == last], "length", "actions in a plan"),
     ):
-        yield View(title, own, across, label, sorted(set(own[across])))
+        yield View(title, panel_rows, across, label, sorted(set(panel_rows[across])))
 
 
 def curriculum_tables(rows: pd.DataFrame) -> Iterator[Table]:

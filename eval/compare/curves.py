@@ -73,14 +73,16 @@ def drawn_uniformly(starts: Starts, share: float, num_plans: int, generator: tor
 
 
 def decided(
-    starts: Starts, own: Drawn, uniform: Drawn | None, num_plans: int, share: float, generator: torch.Generator
+    starts: Starts, proposed: Drawn, uniform: Drawn | None, num_plans: int, share: float, generator: torch.Generator
 ) -> Tensor:
     """The scores `[B, D]` of D decisions of each start, each for the best of a block of candidates.
 
     What counts are exact scores, which differ from the planner's estimates in stochastic worlds.
     """
-    whole = own if uniform is None else Drawn(*(torch.cat(pair, 1) for pair in zip(own, uniform, strict=True)))
-    estimated, number = whole.estimated, own.estimated.shape[1]
+    whole = (
+        proposed if uniform is None else Drawn(*(torch.cat(pair, 1) for pair in zip(proposed, uniform, strict=True)))
+    )
+    estimated, number = whole.estimated, proposed.estimated.shape[1]
     if not starts.world.stochastic:
         return estimated.gather(1, choices(estimated, number, num_plans, share))
     keys = torch.rand(estimated.shape, generator=generator, device=estimated.device)
@@ -98,15 +100,15 @@ def tried(
 ) -> dict[int, dict[Sampling, float]]:
     """For each number of candidates the normalised score of each way of sampling them, all from the same draws."""
     ways = settings_of(prior) if settings is None else settings
-    most, found = max(numbers), {number: dict.fromkeys(ways, 0.0) for number in numbers}
+    most, scores = max(numbers), {number: dict.fromkeys(ways, 0.0) for number in numbers}
     uniform = drawn_uniformly(starts, max(one.uniform_share for one in ways), most, generator)
     for alike in dict.fromkeys(one._replace(uniform_share=0.0) for one in ways):
-        own = drawn(starts, prior, most, alike, generator)
+        candidates = drawn(starts, prior, most, alike, generator)
         for one in (one for one in ways if one._replace(uniform_share=0.0) == alike):
             for number in numbers:
-                score = decided(starts, own, uniform, number, one.uniform_share, generator)
-                found[number][one] = starts.reached(score)["share"]
-    return found
+                score = decided(starts, candidates, uniform, number, one.uniform_share, generator)
+                scores[number][one] = starts.reached(score)["share"]
+    return scores
 
 
 def best(tables: Collection[Mapping[Sampling, float]]) -> Sampling:
@@ -126,9 +128,9 @@ def curve(
     """
     share = sampling.uniform_share
     uniform = drawn_uniformly(starts, share, max(budgets), generator)
-    own = drawn(starts, prior, max(budgets), sampling, generator)
-    found = [starts.reached(decided(starts, own, uniform, number, share, generator)) for number in budgets]
-    return {name: [one[name] for one in found] for name in found[0]}
+    candidates = drawn(starts, prior, max(budgets), sampling, generator)
+    reached = [starts.reached(decided(starts, candidates, uniform, number, share, generator)) for number in budgets]
+    return {name: [one[name] for one in reached] for name in reached[0]}
 
 
 def seconds_per_decision(

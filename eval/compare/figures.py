@@ -75,10 +75,10 @@ def score_panels(views: Sequence[View], height: float = 3.2, log: bool = False) 
     style = styles(name for view in views for name in view.rows["name"])
     for panel, view in zip(axes, views, strict=True):
         for name in style:
-            own = view.rows[view.rows["name"] == name].sort_values(view.across)
+            curve = view.rows[view.rows["name"] == name].sort_values(view.across)
             band(
                 panel,
-                own[[view.across, "oracle_share", "low", "high"]].to_numpy(),
+                curve[[view.across, "oracle_share", "low", "high"]].to_numpy(),
                 style[name][0],
                 name,
                 style[name][1],
@@ -129,8 +129,8 @@ def curriculum_figure(rows: pd.DataFrame, strong: Sequence[str], style: Mapping[
 def _curves(axes: Axes, rows: pd.DataFrame, across: str, strong: Sequence[str], style: Mapping[str, Style]) -> None:
     """A line a prior, with a band if it is one of `strong`."""
     for prior in rows["prior"].unique():
-        own, (color, line) = rows[rows["prior"] == prior], style[prior]
-        points = own[[across, "oracle_share", "low", "high"]].astype("float64").to_numpy() * (1, 100, 100, 100)
+        prior_rows, (color, line) = rows[rows["prior"] == prior], style[prior]
+        points = prior_rows[[across, "oracle_share", "low", "high"]].astype("float64").to_numpy() * (1, 100, 100, 100)
         points = points[points[:, 0].argsort()]
         if prior in strong:
             band(axes, points, color, short(prior, 20), line)

@@ -84,22 +84,22 @@ class HorizonPlanner(SamplingPlanner):
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
         _, generator = self._prepare(world, state, generator)
         chunks = self.chunks(state, self.model_steps(world))
-        return join_decisions((self._plan(world, some, generator) for some in chunks), len(state))
+        return join_decisions((self._plan(world, chunk, generator) for chunk in chunks), len(state))
 
     def _plan(self, world: World, state: Tensor, generator: torch.Generator) -> Decision:
-        found = self._try(world, state, self.length, self.first, generator)
+        outcome = self._try(world, state, self.length, self.first, generator)
         left = (self.num_plans - self.first) * self.length
         for k in range(self.rounds):
             share = left // (self.rounds - k)
-            horizon = self._best_horizon(found, left)
+            horizon = self._best_horizon(outcome, left)
             left -= share
             for depth in horizon.unique().tolist():
-                here = (horizon == depth).nonzero()[:, 0]
-                more = self._try(world, state[here], depth, share // depth, generator)
-                found = found.join(here, more, generator)
-        return found.decision._replace(model_steps=int(found.steps.max()) if len(state) else 0)
+                rows = (horizon == depth).nonzero()[:, 0]
+                more = self._try(world, state[rows], depth, share // depth, generator)
+                outcome = outcome.join(rows, more, generator)
+        return outcome.decision._replace(model_steps=int(outcome.steps.max()) if len(state) else 0)
 
-    def _try(self, world: World, state: Tensor, depth: int, number: int, generator: torch.Generator) -> "_Found":
+    def _try(self, world: World, state: Tensor, depth: int, number: int, generator: torch.Generator) -> "_Outcome":
         """Try `number` plans of `depth` actions from each start."""
         rollouts, temperature = self.num_rollouts, self.temperature
         sampler = SamplingPlanner(
@@ -115,7 +115,7 @@ class HorizonPlanner(SamplingPlanner):
         ties = (score == best.score[:, None, None]).sum((1, 2))
         longer = self.length - depth
         steps = torch.full_like(ties, sampler.model_steps(world))
-        return _Found(best._replace(plan=pad(best.plan, (0, longer))), ties, pad(moments, (0, 0, 0, longer)), steps)
+        return _Outcome(best._replace(plan=pad(best.plan, (0, longer))), ties, pad(moments, (0, 0, 0, longer)), steps)
 
     def _warn_of_costs(self, world: World, score: Tensor) -> None:
         """Warn where the `score [B, P, L]` of all prefixes only ever falls, so that each plan stops at once."""
@@ -134,9 +134,9 @@ class HorizonPlanner(SamplingPlanner):
                 stacklevel=5,
             )
 
-    def _best_horizon(self, found: "_Found", left: int) -> Tensor:
+    def _best_horizon(self, outcome: "_Outcome", left: int) -> Tensor:
         """The horizon `[B]` with the greatest expected improvement for `left` more steps; of equals the longest."""
-        moments = found.moments + POOLED * found.moments.sum(0) / found.moments.sum(0)[:, :1].clamp(min=1)
+        moments = outcome.moments + POOLED * outcome.moments.sum(0) / outcome.moments.sum(0)[:, :1].clamp(min=1)
         number, total, squares = moments.unbind(-1)
         mean = total / number
         spread = (squares / number - mean**2).clamp(min=0).sqrt()
@@ -147,12 +147,12 @@ class HorizonPlanner(SamplingPlanner):
         # The best of n scores is below x with probability q where each of them is with probability q ** (1 / n).
         above = -torch.expm1(share.log() / tries[:, None])
         best = mean[..., None] - spread[..., None] * torch.special.ndtri(above)
-        gain = (best - found.decision.score.double()[:, None, None]).clamp(min=0).mean(-1).nan_to_num(0.0, 0.0)
+        gain = (best - outcome.decision.score.double()[:, None, None]).clamp(min=0).mean(-1).nan_to_num(0.0, 0.0)
         longest_first: Tensor = gain.flip(1).argmax(1)
         return self.length - longest_first
 
 
-class _Found(NamedTuple):
+class _Outcome(NamedTuple):
     """The candidates from B starts so far.
 
     Attributes:
@@ -167,23 +167,23 @@ class _Found(NamedTuple):
     moments: Tensor
     steps: Tensor
 
-    def join(self, here: Tensor, more: "_Found", generator: torch.Generator) -> "_Found":
-        """Together with `more` from the starts `here`; among equally good candidates the choice stays uniform."""
-        own, new = self.decision, more.decision
-        score = own.score[here]
-        ties = torch.where(new.score == score, self.ties[here] + more.ties, self.ties[here])
-        draw = torch.rand(len(here), generator=generator, device=here.device)
+    def join(self, rows: Tensor, more: "_Outcome", generator: torch.Generator) -> "_Outcome":
+        """Together with `more` from the starts `rows`; among equally good candidates the choice stays uniform."""
+        old, new = self.decision, more.decision
+        score = old.score[rows]
+        ties = torch.where(new.score == score, self.ties[rows] + more.ties, self.ties[rows])
+        draw = torch.rand(len(rows), generator=generator, device=rows.device)
         takes = (new.score > score) | ((new.score == score) & (draw * ties < more.ties))
         ties = torch.where(new.score > score, more.ties, ties)
         parts = []
-        for one, other in zip((*own[:3], own.lengths), (*new[:3], new.lengths), strict=True):
+        for one, other in zip((*old[:3], old.lengths), (*new[:3], new.lengths), strict=True):
             assert isinstance(one, Tensor)
             assert isinstance(other, Tensor)
-            part = one.clone()
-            part[here[takes]] = other[takes].to(one.dtype)
-            parts.append(part)
+            merged = one.clone()
+            merged[rows[takes]] = other[takes].to(one.dtype)
+            parts.append(merged)
         steps, moments = self.steps.clone(), self.moments.clone()
-        steps[here] += more.steps
-        moments[here] += more.moments
+        steps[rows] += more.steps
+        moments[rows] += more.moments
         decision = Decision(parts[0], parts[1], parts[2], 0, parts[3])
-        return _Found(decision, self.ties.scatter(0, here, ties), moments, steps)
+        return _Outcome(decision, self.ties.scatter(0, rows, ties), moments, steps)

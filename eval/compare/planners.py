@@ -93,7 +93,7 @@ def _entries(contest: Contest, one: Contestant, name: str) -> list[dict[str, Any
     """What a planner reaches with a prior; the temperature is chosen for both, in the validation worlds."""
     numbers = contest.settings.num_plans
 
-    def made(starts: Starts, number: int, temperature: float) -> Planner:
+    def make_planner(starts: Starts, number: int, temperature: float) -> Planner:
         how: dict[str, Any] = starts.task.scoring | {"temperature": temperature}
         if starts.world.stochastic:
             how["num_rollouts"] = ROLLOUTS
@@ -102,7 +102,7 @@ def _entries(contest: Contest, one: Contestant, name: str) -> list[dict[str, Any
         return PLANNERS[name](one.prior, starts.length, number, **how)
 
     def reached(starts: Starts, number: int, temperature: float) -> dict[str, Any]:
-        planner = made(starts, number, temperature)
+        planner = make_planner(starts, number, temperature)
         return (replanned if name == "replanning" else planned)(starts, planner, contest.generator)
 
     best = 1.0
@@ -111,7 +111,7 @@ def _entries(contest: Contest, one: Contestant, name: str) -> list[dict[str, Any
         shares = {t: reached(validation, max(numbers), t)["share"] for t in TEMPERATURES}
         best = max(shares, key=lambda t: shares[t])
     else:  # a decision that is not timed, since the first may compile loops
-        few = made(contest.starts, min(numbers), best)
+        few = make_planner(contest.starts, min(numbers), best)
         few.plan(contest.starts.world, contest.starts.state[:1], torch.Generator().manual_seed(0))
     label = {"planner": name, "prior": one.label, "context": one.context, "temperature": best}
     return [label | {"num_plans": number} | reached(contest.starts, number, best) for number in numbers]
@@ -157,15 +157,15 @@ def planner_document(
     score = "normalised score, % of the optimum"
     tables, boxes = [], []
     for world, about in {one["world"]: one["about"] for one in results}.items():
-        here = rows[rows["world"] == world].merge(gaps[[*PLACE, "p_holm"]], "left", PLACE)
-        tables.append(planner_table(here, baseline))
+        world_rows = rows[rows["world"] == world].merge(gaps[[*PLACE, "p_holm"]], "left", PLACE)
+        tables.append(planner_table(world_rows, baseline))
         shown = gaps[(gaps["world"] == world) & (gaps["prior"] != "uniform") & (gaps["num_plans"] == most)]
         if len(shown):
             above = f"{world}, {most:,} plans: differences to {baseline}"
             tables.append(runs.difference_table(shown, above, NAMES, score, 100))
         alt = f"Normalised score in {world} against model steps, a line a planner; the numbers are in the tables."
         caption = f"{world}: {about}. Bands: Student's 95 % intervals over seeds."
-        boxes.append(FigureBox(planner_figure(here), caption, alt))
+        boxes.append(FigureBox(planner_figure(world_rows), caption, alt))
     if len(shown := across[across["num_plans"] == most]):
         names = {"prior": "prior", "planner": "planner"}
         tables.append(runs.across_table(shown, names, "score", baseline, f"the {score}, {most:,} plans", 100))
@@ -205,12 +205,12 @@ def planner_figure(rows: pd.DataFrame) -> Figure:
         [
             View(
                 str(prior) if context == "none" else f"{prior}, context: {context}",
-                own.assign(name=own["planner"]),
+                panel_rows.assign(name=panel_rows["planner"]),
                 "model_steps",
                 "model steps per start",
                 ticks,
             )
-            for (prior, context), own in rows.groupby(["prior", "context"], sort=False)
+            for (prior, context), panel_rows in rows.groupby(["prior", "context"], sort=False)
         ],
         log=True,
     )

@@ -120,23 +120,23 @@ class ContextMarkov(Prior):
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         if context is None:
             raise ValueError("context: this prior takes a context, and none was given")
-        return self._combined(self.chain.start(batch_size, self.index(context)), self.fallback.start(batch_size))
+        return self._combine(self.chain.start(batch_size, self.index(context)), self.fallback.start(batch_size))
 
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         number = None if context is None else self.index(context)
-        return self._combined(self.chain.step(action, state[:, 0], number), self.fallback.step(action, state[:, 1]))
+        return self._combine(self.chain.step(action, state[:, 0], number), self.fallback.step(action, state[:, 1]))
 
-    def _combined(self, chain: tuple[Tensor, Tensor], fallback: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    def _combine(self, chain: tuple[Tensor, Tensor], fallback: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         """The logits of the chain where its last context is known, else of the fallback; and the states of both."""
-        known = chain[1] % self.index.size < self.index.size - 1
-        return torch.where(known[:, None], chain[0], fallback[0]), torch.stack([chain[1], fallback[1]], -1)
+        in_index = chain[1] % self.index.size < self.index.size - 1
+        return torch.where(in_index[:, None], chain[0], fallback[0]), torch.stack([chain[1], fallback[1]], -1)
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         if context is None:
             raise ValueError("context: this prior takes a context, and none was given")
         number = self.index(context)
-        known = number < self.index.size - 1
-        return torch.where(known[..., None], self.chain(plans, number), self.fallback(plans))
+        in_index = number < self.index.size - 1
+        return torch.where(in_index[..., None], self.chain(plans, number), self.fallback(plans))
 
 
 class Renumbered(Prior):
@@ -149,7 +149,7 @@ class Renumbered(Prior):
         self.prior, self.context_per, self.context_names = prior, prior.context_per, prior.context_names
         self.register_buffer("number", number)
         if prior.action_names is not None:
-            self.action_names = tuple(prior.action_names[known] for known in number.tolist())
+            self.action_names = tuple(prior.action_names[action] for action in number.tolist())
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         logits, state = self.prior.start(batch_size, context)

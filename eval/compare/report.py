@@ -159,12 +159,12 @@ def headlines(results: Results) -> Section:
         labels = plain["world"].map(breakable)
         tables.append(table_by(plain.assign(world=labels), {"world": "world"}, "num_plans", _gaps(plain), caption))
     for what in AGAINST:
-        if len(own := results.paired[results.paired["what"] == what]):
+        if len(differences := results.paired[results.paired["what"] == what]):
             caption = f"{what[0].upper() + what[1:]} prior, percentage points, by candidate plans. {HALF} {HOLM}"
-            labels = own["world"].map(breakable)
-            of = own.assign(world=labels, rounds=np.where(own["rounds"] == "0", "before", "after"))
+            labels = differences["world"].map(breakable)
+            of = differences.assign(world=labels, rounds=np.where(differences["rounds"] == "0", "before", "after"))
             names = {"world": "world", "context": "context", "curriculum": "rounds"}
-            tables.append(table_by(of, names, "num_plans", _gaps(own), caption))
+            tables.append(table_by(of, names, "num_plans", _gaps(differences), caption))
     for setting, rows in by_setting(words[best]):
         how = f"{setting} the horizon curriculum"
         caption = f"Best neural minus best Markov prior with {results.shown:,} plans, {how}. Hollow: not significant."
@@ -186,14 +186,14 @@ def over_worlds(
     rows: pd.DataFrame, names: Mapping[str, Column], headings: tuple[str, str], unit: str
 ) -> Iterator[Table]:
     """An `across_table` for each context and curriculum."""
-    for setting, own in by_setting(rows):
-        yield across_table(own, names, *headings, unit, 100, f", {setting} the curriculum")
+    for setting, setting_rows in by_setting(rows):
+        yield across_table(setting_rows, names, *headings, unit, 100, f", {setting} the curriculum")
 
 
 def by_setting(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     """The rows of each context and curriculum, and in words, such as "no context, before", which they are."""
-    for (context, after), own in grouped(rows.assign(after=rows["rounds"] > 0), ["context", "after"]):
-        yield f"{context.replace('none', 'no')} context, {'after' if after else 'before'}", own
+    for (context, after), setting_rows in grouped(rows.assign(after=rows["rounds"] > 0), ["context", "after"]):
+        yield f"{context.replace('none', 'no')} context, {'after' if after else 'before'}", setting_rows
 
 
 def reasons(results: Results) -> Section:
@@ -211,17 +211,17 @@ def reasons(results: Results) -> Section:
         " per held-out action, before the curriculum. ahead early: by how many percentage points networks are"
         f" significantly better with {results.num_plans[0]:,} plans."
     )
-    made = [table(results.reasons, columns, caption, align="llrrrr")] if len(results.reasons) else []
-    return Section("Where networks are not better", [REASONS], made)
+    tables = [table(results.reasons, columns, caption, align="llrrrr")] if len(results.reasons) else []
+    return Section("Where networks are not better", [REASONS], tables)
 
 
 def scores(results: Results, style: Mapping[str, Style], after: bool) -> Iterator[FigureBox]:
     """Normalised scores against the number of plans, a figure a world; before or after the horizon curriculum."""
     about = {run["world"]: run["about"] for run in results.runs}
     for (world,), rows in grouped(results.curves[results.curves["context"] == "none"], ["world"]):
-        own = rows[((rows["rounds"] > 0) == after) | rows["prior"].isna() | (rows["prior"] == "uniform")]
-        if own["prior"].notna().any() and (own["rounds"].any() or not after):
-            drawn = figures.score_figure(own, _strong(own[own["num_plans"] == results.shown]), style)
+        curves = rows[((rows["rounds"] > 0) == after) | rows["prior"].isna() | (rows["prior"] == "uniform")]
+        if curves["prior"].notna().any() and (curves["rounds"].any() or not after):
+            drawn = figures.score_figure(curves, _strong_priors(curves[curves["num_plans"] == results.shown]), style)
             yield FigureBox(drawn, "" if after else f"{world}: {about[world]}.", f"normalised scores in {world}")
 
 
@@ -242,25 +242,27 @@ def gains(results: Results, style: Mapping[str, Style], what: str) -> Iterator[F
     rows = results.paired[(results.paired["what"] == what) & (results.paired["num_plans"] == results.shown)]
     points = 100 * rows[["difference", "low", "high"]].rename(columns={"difference": "mean"})
     rows = rows[["world", "context"]].assign(prior=rows["first"], after=rows["rounds"] != "0").join(points)
-    for (context, after), own in grouped(rows, ["context", "after"]):
+    for (context, after), gap_rows in grouped(rows, ["context", "after"]):
         how = f"{what.capitalize()} (context: {context}{', after' * bool(after and context.endswith(' - none'))})"
         caption = f"{how}, with {results.shown:,} plans. Intervals: 95 %, over seeds."
-        yield FigureBox(figures.dots_figure(own, style, POINTS), caption, how)
+        yield FigureBox(figures.dots_figure(gap_rows, style, POINTS), caption, how)
 
 
 def curriculum(results: Results, style: Mapping[str, Style]) -> Iterator[FigureBox]:
     """Curves against rounds of the horizon curriculum, a figure a world and context."""
-    for (world, _), own in grouped(results.curriculum, ["world", "context"]):
-        drawn = figures.curriculum_figure(own, _strong(own[own["round"] == own["round"].max()]), style)
-        caption = f"{own['num_plans'].iloc[0]:,} candidate plans."
+    for (world, _), curves in grouped(results.curriculum, ["world", "context"]):
+        drawn = figures.curriculum_figure(
+            curves, _strong_priors(curves[curves["round"] == curves["round"].max()]), style
+        )
+        caption = f"{curves['num_plans'].iloc[0]:,} candidate plans."
         yield FigureBox(drawn, caption, f"normalised scores in {world} after each round")
 
 
 def bits(results: Results, style: Mapping[str, Style]) -> Iterator[FigureBox]:
     """Bits of held-out plans, a figure a world."""
     rows = results.bits[(results.bits["rounds"] == 0) & (results.bits["prior"] != "uniform")]
-    for (world,), own in grouped(rows, ["world"]):
-        yield FigureBox(figures.bits_figure(own, style), "", f"bits per action in {world}")
+    for (world,), world_rows in grouped(rows, ["world"]):
+        yield FigureBox(figures.bits_figure(world_rows, style), "", f"bits per action in {world}")
 
 
 def drawn_plans(results: Results, style: Mapping[str, Style]) -> Iterator[FigureBox]:
@@ -276,7 +278,7 @@ def transitions(results: Results) -> Iterator[FigureBox]:
     rows = results.rows[(results.rows["context"] == "none") & (results.rows["num_plans"] == results.shown)]
     for world in results.worlds:
         runs = [run for run in results.runs if run["world"] == world and run.get("transitions")]
-        strong = _strong(rows[(rows["world"] == world) & (rows["prior"] != "uniform")])
+        strong = _strong_priors(rows[(rows["world"] == world) & (rows["prior"] != "uniform")])
         for prior in (prior for prior in (runs[0]["transitions"] if runs else ()) if prior in strong):
             matrices = np.array([run["transitions"][prior] for run in runs if prior in run["transitions"]])
             # An action that never came has a row of zeros in its seed.
@@ -304,7 +306,7 @@ def about_worlds(results: Results) -> Section:
 def tables_of(results: Results, world: str) -> Iterator[Table]:
     """Of a world: normalised scores and their differences, plans needed, bits, optimal starts and times."""
     rows, needed, bits = (
-        _labelled(frame[frame["world"] == world]) for frame in (results.rows, results.efficiency, results.bits)
+        _label_rows(frame[frame["world"] == world]) for frame in (results.rows, results.efficiency, results.bits)
     )
     caption = f"{world}: normalised score, % of the optimum, by candidate plans. {HALF}"
     for _, row in rows[rows["num_plans"].isna()].iterrows():
@@ -355,7 +357,7 @@ def _gaps(rows: pd.DataFrame) -> list[str]:
     return [_gap(row, row["p_holm"] < 0.05) for _, row in rows.iterrows()]
 
 
-def _labelled(rows: pd.DataFrame) -> pd.DataFrame:
+def _label_rows(rows: pd.DataFrame) -> pd.DataFrame:
     """Rows with the names of their priors in tables."""
     context = (", " + rows["context"] + " context").replace(", none context", "")
     return rows.assign(label=rows["prior"] + context + np.where(rows["rounds"] > 0, ", after curriculum", ""))
@@ -388,7 +390,7 @@ def _median(row: Any, name: str, beyond: str) -> str:
     return f"{median} ({ends[0]} to {ends[1]})" if median != beyond and ends != [beyond] * 2 else median
 
 
-def _strong(rows: pd.DataFrame) -> list[str]:
+def _strong_priors(rows: pd.DataFrame) -> list[str]:
     """The priors of rows to be drawn with a band: all but the chains that are not the best."""
     ends = rows[rows["prior"].notna()].drop_duplicates("prior", keep="last").set_index("prior")["oracle_share"]
     chains = ends[[kind_of(prior) == "markov" for prior in ends.index]]

@@ -137,18 +137,18 @@ class Results:
         return {
             world: {
                 Key(*key): one.pivot(index="seed", columns="num_plans", values="share")
-                for key, one in grouped(own, PRIOR)
+                for key, one in grouped(world_scores, PRIOR)
             }
-            for (world,), own in grouped(self.scores[self.scores["prior"].notna()], ["world"])
+            for (world,), world_scores in grouped(self.scores[self.scores["prior"].notna()], ["world"])
         }
 
     @cached_property
     def curves(self) -> pd.DataFrame:
         """The normalised score: a row a world, planner, prior and number of plans, with its interval over seeds."""
         by = ["world", "planner", *PRIOR, "num_plans"]
-        found = seed_means(self.scores, by, "share", ["model_steps", "at_oracle", "seconds", *SAMPLING])
-        found["model_steps"] = found["model_steps"].convert_dtypes()
-        return found.rename(columns={"share": "oracle_share", "seconds": "seconds_per_decision"})
+        curves = seed_means(self.scores, by, "share", ["model_steps", "at_oracle", "seconds", *SAMPLING])
+        curves["model_steps"] = curves["model_steps"].convert_dtypes()
+        return curves.rename(columns={"share": "oracle_share", "seconds": "seconds_per_decision"})
 
     @cached_property
     def rows(self) -> pd.DataFrame:
@@ -158,9 +158,9 @@ class Results:
             ValueError: runs do not have one of these.
         """
         for world, tables in self._by_prior.items():
-            known = next(iter(tables.values())).columns.tolist()
-            if missing := sorted(set(self.num_plans) - set(known)):
-                raise ValueError(f"num_plans: {world} has {known}, not {missing[0]}")
+            budgets = next(iter(tables.values())).columns.tolist()
+            if missing := sorted(set(self.num_plans) - set(budgets)):
+                raise ValueError(f"num_plans: {world} has {budgets}, not {missing[0]}")
         number = self.curves["num_plans"]
         return self.curves.loc[number.isna() | number.isin(self.num_plans)].reset_index(drop=True)
 
@@ -199,10 +199,10 @@ class Results:
                 gaps = (difference(tables, pair, self.shown) for pair in _headlines(tables, like))
                 if gap := next(filter(None, gaps), None):  # the first pair that can be compared
                     rows.append({"world": world} | gap | {"context": like[0], "rounds": like[1]})
-        found = pd.DataFrame(rows, columns=["world", *GAP])
-        found = corrected(found.assign(after=found["rounds"] > 0), ["context", "after"]).drop(columns="after")
-        better = found["first"].where(found["difference"] > 0, found["second"])
-        return found.assign(better=better.where(found["p_holm"] < 0.05))
+        answers = pd.DataFrame(rows, columns=["world", *GAP])
+        answers = corrected(answers.assign(after=answers["rounds"] > 0), ["context", "after"]).drop(columns="after")
+        better = answers["first"].where(answers["difference"] > 0, answers["second"])
+        return answers.assign(better=better.where(answers["p_holm"] < 0.05))
 
     @cached_property
     def efficiency(self) -> pd.DataFrame:
@@ -214,22 +214,22 @@ class Results:
         `reached` in less than all seeds, is more than `most`.
         """
         names = [f"{name}{end}" for name in ("needed", "factor") for end in ("", "_low", "_high")]
-        found = []
+        rows = []
         for world, tables in self._by_prior.items():
             random = tables.get(UNIFORM, pd.DataFrame())
-            for key, own in tables.items():
-                seeds, budgets = own.index.intersection(random.index), [int(number) for number in own.columns]
+            for key, scores in tables.items():
+                seeds, budgets = scores.index.intersection(random.index), [int(number) for number in scores.columns]
                 if seeds.empty:
                     continue
                 climbs = [optimize.isotonic_regression(random.loc[seed]).x for seed in seeds]
                 plans, others = (
-                    np.log2([needed(curve, budgets, climb[-1]) for curve, climb in zip(some, climbs, strict=True)])
-                    for some in (own.loc[seeds].to_numpy(), climbs)
+                    np.log2([needed(curve, budgets, climb[-1]) for curve, climb in zip(curves, climbs, strict=True)])
+                    for curves in (scores.loc[seeds].to_numpy(), climbs)
                 )
                 row = (world, "sampling", *key, *_median(plans), *_median(others - plans))
-                found.append((*row, int(np.isfinite(plans).sum()), len(seeds), budgets[-1]))
+                rows.append((*row, int(np.isfinite(plans).sum()), len(seeds), budgets[-1]))
         columns = ["world", "planner", *PRIOR, *names, "reached", "seeds", "most"]
-        return pd.DataFrame(found, columns=columns)
+        return pd.DataFrame(rows, columns=columns)
 
     @cached_property
     def bits(self) -> pd.DataFrame:
@@ -240,8 +240,8 @@ class Results:
         """
         frame, by = frame_of(self.runs).astype({"bits": "float64"}), ["world", *PRIOR]
         frame = frame[frame["bits"].notna()]
-        found = seed_means(frame, by, "bits").rename(columns={"bits": "bits_per_action"})
-        bits = {place: own.set_index("seed")["bits"] for place, own in grouped(frame, by)}
+        means = seed_means(frame, by, "bits").rename(columns={"bits": "bits_per_action"})
+        bits = {place: rows.set_index("seed")["bits"] for place, rows in grouped(frame, by)}
         more = []
         for place, mine in bits.items():
             like = (place[0], place[2], 0)
@@ -249,7 +249,7 @@ class Results:
             values = -pd.concat([mine, *chains], axis=1, join="inner").to_numpy().T  # the fewer bits, the better
             gap = best_difference(values[:1], values[1:]) if chains and values.shape[1] > 1 else [np.nan] * 4
             more.append((-gap[0], -gap[2], -gap[1], gap[3]))
-        return found.join(pd.DataFrame(more, columns=["more", "more_low", "more_high", "p_value"]))
+        return means.join(pd.DataFrame(more, columns=["more", "more_low", "more_high", "p_value"]))
 
     @cached_property
     def curriculum(self) -> pd.DataFrame:
@@ -269,15 +269,15 @@ class Results:
         """
         at = ["world", "context", "rounds"]
         best = self.words[(self.words["what"] == BEST) & (self.words["better"] != self.words["first"])]
-        found = best[[*at, "second_share"]].rename(columns={"second_share": "markov_share"})
+        reasons = best[[*at, "second_share"]].rename(columns={"second_share": "markov_share"})
         for kind in ("neural", "markov"):
-            own = self.bits[(self.bits["rounds"] == 0) & (self.bits["prior"].map(kind_of) == kind)]
-            fewest = own.groupby(["world", "context"])["bits_per_action"].min().rename(f"{kind}_bits")
-            found = found.merge(fewest.reset_index(), "left", on=["world", "context"])
+            kind_bits = self.bits[(self.bits["rounds"] == 0) & (self.bits["prior"].map(kind_of) == kind)]
+            fewest = kind_bits.groupby(["world", "context"])["bits_per_action"].min().rename(f"{kind}_bits")
+            reasons = reasons.merge(fewest.reset_index(), "left", on=["world", "context"])
         early = self.paired[(self.paired["what"] == BEST) & (self.paired["num_plans"] == self.num_plans[0])]
         early = early[(early["difference"] > 0) & (early["p_holm"] < 0.05) & (self.num_plans[0] < self.shown)]
         early = early.astype({"rounds": "int64"}).rename(columns={"difference": "early"})
-        return found.merge(early[[*at, "early"]], "left", on=at)
+        return reasons.merge(early[[*at, "early"]], "left", on=at)
 
     @cached_property
     def across(self) -> pd.DataFrame:
@@ -286,12 +286,13 @@ class Results:
         Each learned prior with random plans, and each that is no chain with each chain of equal context and curriculum.
         Worlds have different numbers of rounds: `rounds` is 1 after the curriculum.
         """
-        own = self.scores[(self.scores["num_plans"] == self.shown) & self.scores["prior"].notna()]
-        own = own.assign(rounds=(own["rounds"] > 0).astype("int64"), kind=own["prior"].map(kind_of))
-        own = own[["world", "seed", *PRIOR, "kind", "share"]]
-        chains, random = own[own["kind"] == "markov"], own[own["kind"] == "uniform"].drop(columns=["context", "rounds"])
-        others = own[own["kind"].isin(["neural", "other"])].merge(chains, on=["world", "seed", "context", "rounds"])
-        pairs = pd.concat([others, own[own["kind"] != "uniform"].merge(random, on=["world", "seed"])])
+        rows = self.scores[(self.scores["num_plans"] == self.shown) & self.scores["prior"].notna()]
+        rows = rows.assign(rounds=(rows["rounds"] > 0).astype("int64"), kind=rows["prior"].map(kind_of))
+        rows = rows[["world", "seed", *PRIOR, "kind", "share"]]
+        chains = rows[rows["kind"] == "markov"]
+        random = rows[rows["kind"] == "uniform"].drop(columns=["context", "rounds"])
+        others = rows[rows["kind"].isin(["neural", "other"])].merge(chains, on=["world", "seed", "context", "rounds"])
+        pairs = pd.concat([others, rows[rows["kind"] != "uniform"].merge(random, on=["world", "seed"])])
         names = {"prior_x": "prior", "prior_y": "baseline", "share_x": "first", "share_y": "second"}
         return across_worlds(pairs.rename(columns=names), ["prior", "context", "rounds", "baseline"])
 
@@ -302,15 +303,15 @@ class Results:
         A row a prior, context (`none`; `most`: the last that each world offers), `rounds` (1 after the curriculum) and
         number of plans.
         """
-        own = self.scores[self.scores["num_plans"].isin(self.num_plans) & self.scores["prior"].notna()]
-        own = own[own["prior"] != "uniform"].assign(rounds=(own["rounds"] > 0).astype("int64"))
-        most = own["context"].map(MORE_CONTEXT)
-        last = most == most.groupby(own["world"]).transform("max")
-        plain = own["context"] == "none"
-        parts = [own[plain], own[last].assign(context="most")] if (plain != last).any() else [own[plain]]
-        own = pd.concat(parts)[["world", "seed", *PRIOR, "num_plans", "share"]]
-        like = [name for name in own.columns if name not in ("prior", "share")]
-        pairs = own[own["prior"] != COMBINED].merge(own[own["prior"] == COMBINED], on=like)
+        scores = self.scores[self.scores["num_plans"].isin(self.num_plans) & self.scores["prior"].notna()]
+        scores = scores[scores["prior"] != "uniform"].assign(rounds=(scores["rounds"] > 0).astype("int64"))
+        most = scores["context"].map(MORE_CONTEXT)
+        last = most == most.groupby(scores["world"]).transform("max")
+        plain = scores["context"] == "none"
+        parts = [scores[plain], scores[last].assign(context="most")] if (plain != last).any() else [scores[plain]]
+        scores = pd.concat(parts)[["world", "seed", *PRIOR, "num_plans", "share"]]
+        like = [name for name in scores.columns if name not in ("prior", "share")]
+        pairs = scores[scores["prior"] != COMBINED].merge(scores[scores["prior"] == COMBINED], on=like)
         names = {"prior_x": "prior", "share_y": "first", "share_x": "second"}
         return across_worlds(pairs.rename(columns=names), [*PRIOR, "num_plans"])
 
@@ -328,10 +329,10 @@ def _pairs(tables: Mapping[Key, pd.DataFrame]) -> Iterator[Pair]:
         if neural and markov:
             yield BEST, neural, markov
         yield from (("neural minus Markov", [one], [other]) for one in neural for other in markov)
-        own = [k for k in keys if k.prior == COMBINED and k[1:] == like]
+        combined = [k for k in keys if k.prior == COMBINED and k[1:] == like]
         for what, others in zip(AGAINST, ([*neural, *markov], markov, neural), strict=True):
-            if own and others:
-                yield what, own, others
+            if combined and others:
+                yield what, combined, others
     for place, key in enumerate(keys):
         for later, other in enumerate(keys):
             alike = other != key and other[1:] == key[1:]
@@ -371,11 +372,12 @@ def difference(tables: Mapping[Key, pd.DataFrame], pair: Pair, num_plans: int) -
     seeds = np.arange(values.shape[1])
     if len(seeds) < 1 + (max(map(len, sides)) > 1):
         return None
-    best = [chosen(own) for own in (first, second)]
+    best = [chosen(scores) for scores in (first, second)]
     names = [
-        " / ".join(dict.fromkeys(side[place].prior for place in own)) for side, own in zip(sides, best, strict=True)
+        " / ".join(dict.fromkeys(side[place].prior for place in places))
+        for side, places in zip(sides, best, strict=True)
     ]
-    means = [float(own[which, seeds].mean()) for own, which in zip((first, second), best, strict=True)]
+    means = [float(scores[which, seeds].mean()) for scores, which in zip((first, second), best, strict=True)]
     about = [" - ".join(dict.fromkeys(map(str, ends))) for ends in zip(sides[0][0][1:], sides[1][0][1:], strict=True)]
     gap = best_difference(first, second) if len(seeds) > 1 else (float((first - second).mean()), *[np.nan] * 3)
     return dict(zip(GAP, (what, *names, *means, *about, num_plans, *gap, len(seeds)), strict=True))
@@ -383,8 +385,8 @@ def difference(tables: Mapping[Key, pd.DataFrame], pair: Pair, num_plans: int) -
 
 def corrected(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     """Rows with `p_holm`: their p-values corrected for the number of rows that agree in `by`; missing ones stay so."""
-    known = rows[rows["p_value"].notna()].astype({"p_value": "float64"})
-    return rows.assign(p_holm=known.groupby(list(by))["p_value"].transform(holm).astype("float64"))
+    tested = rows[rows["p_value"].notna()].astype({"p_value": "float64"})
+    return rows.assign(p_holm=tested.groupby(list(by))["p_value"].transform(holm).astype("float64"))
 
 
 def best_difference(first: Array, second: Array, level: float = 0.95) -> Difference:
@@ -420,8 +422,8 @@ def best_difference(first: Array, second: Array, level: float = 0.95) -> Differe
 def _one_sided(means: Array, errors: Array, number: int) -> Array:
     """P-values of means above 0; of values without any spread, those of a sign test: few may agree by accident."""
     t = np.divide(means, errors, out=np.zeros_like(means), where=errors > 0)
-    found: Array = np.where(errors > 0, stats.t.sf(t, number - 1), np.where(means > 0, 2.0**-number, 1))
-    return found
+    p_values: Array = np.where(errors > 0, stats.t.sf(t, number - 1), np.where(means > 0, 2.0**-number, 1))
+    return p_values
 
 
 def chosen(values: Array) -> NDArray[np.int64]:

@@ -243,14 +243,14 @@ class Contest:
     @cached_property
     def first(self) -> Plans:
         """What the planner that tries all short plans chooses in the training worlds."""
-        return self._collected(self.worlds.training, self.training_starts)
+        return self._collect(self.worlds.training, self.training_starts)
 
     @cached_property
     def held_out_plans(self) -> Plans:
         """The same in the held-out worlds: the plans whose bits are computed."""
-        return self._collected(self.worlds.held_out, self.training_starts // 4)
+        return self._collect(self.worlds.held_out, self.training_starts // 4)
 
-    def _collected(self, world: World, number: int) -> Plans:
+    def _collect(self, world: World, number: int) -> Plans:
         planner = ExhaustivePlanner(self.task.depth, num_rollouts=ROLLOUTS, **self.task.scoring)
         return collect(planner, world, number, context="step", min_score=self.task.min_score, generator=self.generator)
 

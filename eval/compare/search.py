@@ -138,7 +138,7 @@ class Learner:
 
     def reweighted(self, plans: Plans) -> dict[str, Prior]:
         """Priors that have learned from plans drawn with replacement, with each of `WEIGHTS`."""
-        log_prob, found = torch.empty(len(plans)), {}
+        log_prob, priors = torch.empty(len(plans)), {}
         for learned, held_out in folds(plans, 2):
             log_prob[held_out] = self.fitted(plans[learned]).log_prob(plans[held_out])
         for name, weigh in WEIGHTS.items():
@@ -146,8 +146,8 @@ class Learner:
             drawn = plans[index]
             # The same plan is never learned from and validated on.
             drawn = drawn if drawn.group is not None else replace(drawn, group=index, group_names=None)
-            found[name] = self.fitted(drawn)
-        return found
+            priors[name] = self.fitted(drawn)
+        return priors
 
 
 def _entries(contest: Contest, one: Contestant, name: str, prior: Prior) -> list[dict[str, Any]]:
@@ -192,9 +192,9 @@ def search_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str,
         f"Normalised score less that of {BOTH}, in points: means over {len(set(frame['world']))} worlds, by number of"
         " candidates. ±: Student's 95 % interval over seeds, paired. *: p < 0.05, corrected for all tests (Holm)."
     )
-    own = runs.table_by(gaps, {"prior": "prior", "": "planner"}, "num_plans", cells, caption, "Over worlds")
+    differences = runs.table_by(gaps, {"prior": "prior", "": "planner"}, "num_plans", cells, caption, "Over worlds")
     return replace(
         document,
-        sections=[Section("Differences", tables=[own]), *document.sections],
+        sections=[Section("Differences", tables=[differences]), *document.sections],
         frames={**document.frames, "differences": gaps},
     )

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from eval.__main__ import main
-from eval.compare.horizon import HorizonPlanner, _Found
+from eval.compare.horizon import HorizonPlanner, _Outcome
 from neuroprior import MarkovPrior, SamplingPlanner, TabularWorld, UniformPrior, gridworld
 from neuroprior.testing import check_planner
 from tests.support.reports import FROM_ELSEWHERE
@@ -40,7 +40,7 @@ def gathered(scores):
     moments = torch.stack([torch.ones_like(so_far), so_far, so_far**2], -1).sum(1)
     best = SamplingPlanner(UniformPrior(4), 3, 1).plan(gridworld(3, 3), torch.zeros(len(scores), dtype=torch.long))
     best = best._replace(score=so_far.amax((1, 2)))
-    return _Found(best, torch.ones(len(scores)), moments, torch.zeros(len(scores)))
+    return _Outcome(best, torch.ones(len(scores)), moments, torch.zeros(len(scores)))
 
 
 def test_deep_horizons_count():
