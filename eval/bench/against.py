@@ -30,10 +30,14 @@ def read_results(path: str) -> dict[str, Any]:
         FileNotFoundError: there is no such file.
         ValueError: it is none of the bench's.
     """
-    found = read_json(Path(path))
-    if not isinstance(found, dict) or "settings" not in found or not any(isinstance(found.get(k), list) for k in KEYS):
+    results = read_json(Path(path))
+    if (
+        not isinstance(results, dict)
+        or "settings" not in results
+        or not any(isinstance(results.get(k), list) for k in KEYS)
+    ):
         raise ValueError(f"{path}: no results of the bench; its results.json is expected")
-    return found
+    return results
 
 
 def compared(before: Mapping[str, Any], now: Mapping[str, Any]) -> pd.DataFrame:
@@ -54,35 +58,35 @@ def compared(before: Mapping[str, Any], now: Mapping[str, Any]) -> pd.DataFrame:
                 f" got {before['settings'].get(name)}"
             )
     rows = []
-    for part, names in KEYS.items():
-        earlier = {tuple(row[name] for name in names): row for row in before.get(part, [])}
-        for row in now.get(part, []):
+    for kind, names in KEYS.items():
+        earlier = {tuple(row[name] for name in names): row for row in before.get(kind, [])}
+        for row in now.get(kind, []):
             key = tuple(row[name] for name in names)
             if key in earlier:
-                rows.append(_row(": ".join(map(str, key)) or "from neuroprior import *", part, earlier[key], row))
+                rows.append(_row(": ".join(map(str, key)) or "from neuroprior import *", kind, earlier[key], row))
     if not rows:
         raise ValueError("`against` must have measurements in common with these results, got none")
     return pd.DataFrame(rows)
 
 
-def _row(name: str, part: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+def _row(name: str, kind: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
     factor, verdict = new["seconds"] / old["seconds"], ""
     if "ratio" in new:
         # of peers: the peer's time in units of ours; of the import: ours in units of torch's
-        (old_low, old_high), (new_low, new_high) = (_spread(part, one) for one in (old, new))
-        factor = _relative(part, new["ratio"]) / _relative(part, old["ratio"])
+        (old_low, old_high), (new_low, new_high) = (_spread(kind, one) for one in (old, new))
+        factor = _relative_time(kind, new["ratio"]) / _relative_time(kind, old["ratio"])
         slower, faster = new_low > old_high and factor >= LEAST, new_high < old_low and factor <= 1 / LEAST
         verdict = "slower" if slower else "faster" if faster else "no difference"
     return {"name": name, "before": old["seconds"], "now": new["seconds"], "factor": factor, "verdict": verdict}
 
 
-def _relative(part: str, ratio: float) -> float:
+def _relative_time(kind: str, ratio: float) -> float:
     """Our time in units of the peer's."""
-    return ratio if part == "imports" else 1 / ratio
+    return ratio if kind == "imports" else 1 / ratio
 
 
-def _spread(part: str, row: Mapping[str, Any]) -> tuple[float, float]:
-    ends = sorted(_relative(part, row[end]) for end in ("low", "high"))
+def _spread(kind: str, row: Mapping[str, Any]) -> tuple[float, float]:
+    ends = sorted(_relative_time(kind, row[end]) for end in ("low", "high"))
     return ends[0], ends[1]
 
 

@@ -84,23 +84,25 @@ def bench(
         works += [("gpu", f"{name} on the GPU", partial(measure, name)) for name in ON_DEVICES]
     elif "gpu" in parts:
         console.print("gpu: left out, there is no CUDA device")
-    found: dict[str, Rows] = {}
+    by_kind: dict[str, Rows] = {}
     with Progress("bench", len(works), len(works)) as progress:
-        for part, name, work in works:
+        for kind, name, work in works:
             try:
                 for row in work():
-                    found.setdefault(part, []).append(row)
+                    by_kind.setdefault(kind, []).append(row)
                     # After each, so that nothing that was measured is lost.
-                    write_frames(folder, {part: pd.DataFrame(found[part])})
-                    keyed = {"rows" if part == "peers" else part: rows for part, rows in found.items()}
+                    write_frames(folder, {kind: pd.DataFrame(by_kind[kind])})
+                    keyed = {"rows" if kind == "peers" else kind: rows for kind, rows in by_kind.items()}
                     write_results(folder, {"versions": versions(), "settings": settings, **keyed})
             except ValueError as error:
                 console.print(f"{name}: left out, {error}")
             progress.advance(name)
-    for each in tables(found, settings):
+    for each in tables(by_kind, settings):
         console.print(printed(each.title, each))
     figures = {"peers": peers_figure, "sizes": sizes_figure}
-    write_figures(folder, {part: draw(pd.DataFrame(found[part])) for part, draw in figures.items() if part in found})
+    write_figures(
+        folder, {kind: draw(pd.DataFrame(by_kind[kind])) for kind, draw in figures.items() if kind in by_kind}
+    )
     if against is not None and earlier is not None:
         console.print(_regressions(earlier, read_results(str(folder / "results.json")), against))
     console.print(f"written to {folder}")
@@ -111,16 +113,16 @@ def _regressions(earlier: dict[str, Any], later: dict[str, Any], path: str) -> A
     return printed(shown.title, shown)
 
 
-def tables(found: dict[str, Rows], settings: dict[str, Any]) -> list[Table]:
+def tables(by_kind: dict[str, Rows], settings: dict[str, Any]) -> list[Table]:
     """The tables of what was measured: rows by part."""
     shown: dict[str, Callable[[pd.DataFrame], Table]]
-    if "peers" in found:
-        rows = pd.DataFrame(found["peers"])
-        several = {"busy": found["peers"]} if rows.busy.nunique() > 1 else {}
-        found = found | {"peers": [row for row in found["peers"] if row["busy"] == rows.busy.min()]} | several
+    if "peers" in by_kind:
+        rows = pd.DataFrame(by_kind["peers"])
+        several = {"busy": by_kind["peers"]} if rows.busy.nunique() > 1 else {}
+        by_kind = by_kind | {"peers": [row for row in by_kind["peers"] if row["busy"] == rows.busy.min()]} | several
     shown = {"peers": partial(_peers, settings), "busy": _busy, "sizes": _sizes}
     shown |= {"limits": _limits, "gpu": _gpu, "imports": _imports}
-    return [make(pd.DataFrame(found[part])) for part, make in shown.items() if part in found]
+    return [make(pd.DataFrame(by_kind[kind])) for kind, make in shown.items() if kind in by_kind]
 
 
 def _peers(settings: dict[str, Any], rows: pd.DataFrame) -> Table:
@@ -156,7 +158,7 @@ def _sizes(rows: pd.DataFrame) -> Table:
     """The smallest and the largest of each kind."""
     kinds = rows.groupby("growing", sort=False)
     ends = kinds.first().add_suffix("_first").join(kinds.last().add_suffix("_last")).reset_index()
-    ends["slope"] = [sizes.slope(own) for _, own in kinds]
+    ends["slope"] = [sizes.slope(rows_of_kind) for _, rows_of_kind in kinds]
     columns: dict[str, Column] = {
         "size": "growing",
         "from": "size_first:,",

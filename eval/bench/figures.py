@@ -35,14 +35,14 @@ def sizes_figure(rows: pd.DataFrame) -> Figure:
     kinds = rows.growing.nunique()
     figure, cells = panels(-(-kinds // ACROSS), ACROSS, (11, 2.7 * -(-kinds // ACROSS)))
     rows = rows.assign(peak=rows.peak_bytes.clip(lower=MEBI))
-    for axes, (growing, own) in zip(cells, rows.groupby("growing", sort=False), strict=False):
-        axes.loglog(own["size"], own.seconds, "o-", color=FEWER, ms=4)
+    for axes, (growing, kind_rows) in zip(cells, rows.groupby("growing", sort=False), strict=False):
+        axes.loglog(kind_rows["size"], kind_rows.seconds, "o-", color=FEWER, ms=4)
         axes.set_ylim(_decades(rows.seconds))
-        power = slope(own)
+        power = slope(kind_rows)
         axes.set_title(f"{growing}" if power is None else f"{growing}, slope {power:.2f}", fontsize=10)
-        if own.peak.notna().all():
+        if kind_rows.peak.notna().all():
             right = axes.twinx()
-            right.loglog(own["size"], own.peak, "s--", color=MORE, ms=3, lw=1)
+            right.loglog(kind_rows["size"], kind_rows.peak, "s--", color=MORE, ms=3, lw=1)
             right.set_ylim(_decades(rows.peak))
             right.tick_params(axis="y", colors=MORE)
             if axes is cells[min(kinds, ACROSS) - 1]:

@@ -114,10 +114,10 @@ def against_peers(
         for number in busy:
             with beside(number):
                 times = [(seconds(ours), seconds(theirs) / peer.share) for _ in range(repetitions)]
-            own, other = map(list, zip(*times, strict=True))
-            row = {"job": name, "about": job.about, "setup_seconds": setup, "seconds": median(own), "busy": number}
-            row |= {"peer": peer.name, "peer_seconds": median(other), "share": peer.share}
-            yield row | compared(own, other) | {"goal": peer.goal}
+            our_times, other = map(list, zip(*times, strict=True))
+            row = {"job": name, "about": job.about, "setup_seconds": setup, "seconds": median(our_times)}
+            row |= {"busy": number, "peer": peer.name, "peer_seconds": median(other), "share": peer.share}
+            yield row | compared(our_times, other) | {"goal": peer.goal}
 
 
 def on_device(name: str, device: torch.device, scale: float, repetitions: int) -> Iterator[dict[str, Any]]:
@@ -145,15 +145,15 @@ def on_device(name: str, device: torch.device, scale: float, repetitions: int) -
 
 def sample_short(scale: float) -> Job:
     """Many short plans, which share their beginnings."""
-    return _against_generate(scaled(2_560_000, scale), 8, [scaled(size, scale) for size in (1024, 8192, 65_536)], 500)
+    return _generating_job(scaled(2_560_000, scale), 8, [scaled(size, scale) for size in (1024, 8192, 65_536)], 500)
 
 
 def sample_long(scale: float) -> Job:
     """Long plans, of which hardly two begin alike."""
-    return _against_generate(scaled(8192, scale), 64, [scaled(size, scale) for size in (512, 2048, 8192)], 10)
+    return _generating_job(scaled(8192, scale), 64, [scaled(size, scale) for size in (512, 2048, 8192)], 10)
 
 
-def _against_generate(number: int, length: int, batches: list[int], goal: float) -> Job:
+def _generating_job(number: int, length: int, batches: list[int], goal: float) -> Job:
     """A transformer samples, against one of another package in batches of several sizes."""
 
     def peer(batch: int) -> Peer:
@@ -201,7 +201,7 @@ def sample_beside(scale: float) -> Job:
     world = maze(egocentric=True, view=2, num_layouts=20)
     state = world.reset(scaled(16, scale), torch.Generator().manual_seed(0))
     prior = GRUPrior(3, lags=1, context_size=world.observe(state).shape[1])
-    return _beside("a maze", world, state, prior, 2048, 24)
+    return _sampling_beside("a maze", world, state, prior, 2048, 24)
 
 
 def sample_beside_cube(scale: float) -> Job:
@@ -211,10 +211,10 @@ def sample_beside_cube(scale: float) -> Job:
     state = world.reset(scaled(2000, scale), generator)
     prior = GRUPrior(9, lags=1, context_size=world.observe(state).shape[1])
     prior.fit(plans, generator=generator, max_steps=200, progress=False)
-    return _beside("a cube", world, state, prior, 64, 8)
+    return _sampling_beside("a cube", world, state, prior, 64, 8)
 
 
-def _beside(name: str, world: World, state: Tensor, prior: Prior, number: int, length: int) -> Job:
+def _sampling_beside(name: str, world: World, state: Tensor, prior: Prior, number: int, length: int) -> Job:
     plain = peers.ObservingGRU(prior.num_actions, world.observe(state).shape[1]).eval()
     return Job(
         f"sample {number:,} plans of length {length} beside {name} from {len(state):,} starts, GRU",
@@ -231,12 +231,12 @@ def horizon(make: type[GRUPrior] | type[TransformerPrior], times: int, scale: fl
     """Plans so many times as long as those that a network was trained on; its peer are plans of that length."""
     number = scaled(2048, scale)
     prior = make(4, window=TRAINED - 1)
-    own = partial(prior.sample, number, TRAINED, method="ancestral")
+    baseline = partial(prior.sample, number, TRAINED, method="ancestral")
     name = prior.__class__.__name__.removesuffix("Prior")
     return Job(
         f"sample {number:,} plans of length {times * TRAINED}, {name} trained on {TRAINED}",
         lambda device: partial(prior.to(device).sample, number, times * TRAINED, method="ancestral"),
-        (Peer(f"{times} times plans of length {TRAINED}", lambda: own, round(1 / 1.3, 2), 1 / times),),
+        (Peer(f"{times} times plans of length {TRAINED}", lambda: baseline, round(1 / 1.3, 2), 1 / times),),
     )
 
 
@@ -249,7 +249,7 @@ def sample_combined(scale: float) -> Job:
     prior = CombinedPrior(4, parts)
 
     def dearest() -> Run:
-        runs = [partial(part.sample, number, 8) for part in parts]
+        runs = [partial(expert.sample, number, 8) for expert in parts]
         for run in runs:
             run()  # the first run is slow
         return max(runs, key=seconds)
@@ -333,13 +333,13 @@ def evaluate(scale: float) -> Job:
     generator = torch.Generator().manual_seed(0)
     state = world.reset(starts, generator)
     plans = UniformPrior(4).sample(starts * 256, 8, generator=generator).view(starts, 256, 8)
-    given = world.next_state, world.reward, state, plans
+    arguments = world.next_state, world.reward, state, plans
     return Job(
         f"evaluate {starts:,} starts x 256 plans x 8 steps",
         lambda device: partial(world.to(device).rollout, state.to(device), plans.to(device)),
         (
-            Peer("plain torch indexing", lambda: partial(peers.torch_rollout, *given), 5),
-            Peer("numba, parallel", partial(peers.numba_rollout, *given), 1),
+            Peer("plain torch indexing", lambda: partial(peers.torch_rollout, *arguments), 5),
+            Peer("numba, parallel", partial(peers.numba_rollout, *arguments), 1),
         ),
     )
 
@@ -487,11 +487,11 @@ def control(scale: float) -> Job:
     """One decision over vectors from several starts."""
     world, length, plans = DoubleIntegrator(), 30, scaled(1000, scale)
     state = world.reset(16, torch.Generator().manual_seed(0))
-    own = partial(peers.plain_mppi, world, state, length, plans, 0.5)
+    plain = partial(peers.plain_mppi, world, state, length, plans, 0.5)
     return Job(
         f"MPPI, {plans:,} plans of {length} steps from each of 16 starts, double integrator",
         lambda device: partial(MPPIPlanner(length, plans).plan, world, state, torch.Generator().manual_seed(0)),
-        (Peer("plain PyTorch, one start after the other", lambda: own, 1),),
+        (Peer("plain PyTorch, one start after the other", lambda: plain, 1),),
     )
 
 

@@ -164,11 +164,11 @@ def numpy_table_1(
 
     learned = deterministic(generator.integers(len(reward), size=len(start)))[0]
     random = generator.integers(4, size=(len(start), num_plans, length), dtype=np.uint8)
-    found = {"deterministic": deterministic(start)[1], "random": best(random, start)[1]}
+    scores = {"deterministic": deterministic(start)[1], "random": best(random, start)[1]}
     for order in orders:
         plans = _chain(learned, order, len(start) * num_plans, length).reshape(random.shape)
-        found[f"markov-{order}"] = best(plans, start)[1]
-    return found
+        scores[f"markov-{order}"] = best(plans, start)[1]
+    return scores
 
 
 def _chain(learned: Array, order: int, number: int, length: int) -> Array:
@@ -368,8 +368,8 @@ def jax_policy(prior: Prior) -> tuple[Callable[[int], Any], Callable[[Any, Any],
     w_in, w_hidden, b_in, b_hidden = map(array, prior.gru.all_weights[0])
 
     def step(action: Any, hidden: Any) -> Any:
-        given, own = vectors[action] @ w_in.T + b_in, hidden @ w_hidden.T + b_hidden
-        (r, z, n), (own_r, own_z, own_n) = (numpy.split(gates, 3, -1) for gates in (given, own))
+        from_input, from_hidden = vectors[action] @ w_in.T + b_in, hidden @ w_hidden.T + b_hidden
+        (r, z, n), (own_r, own_z, own_n) = (numpy.split(gates, 3, -1) for gates in (from_input, from_hidden))
         new, share = numpy.tanh(n + nn.sigmoid(r + own_r) * own_n), nn.sigmoid(z + own_z)
         hidden = new + share * (hidden - new)
         return hidden @ head + head_bias, hidden
@@ -403,8 +403,8 @@ def mctx_search(world: TabularWorld, state: Tensor, prior: Prior, simulations: i
 
         def further(t: Any, rollout: Any) -> Any:
             now, value, key, logits, memory = rollout
-            key, own = jax.random.split(key)
-            action = jax.random.categorical(own, logits)
+            key, draw_key = jax.random.split(key)
+            action = jax.random.categorical(draw_key, logits)
             after, reward = move(now, action)
             return after, value + numpy.where(depth + t < length, reward, 0), key, *follow(action, memory)
 

@@ -134,7 +134,7 @@ def _bytes(result: Any) -> int:
         return result.nbytes
     if isinstance(result, torch.nn.Module):
         return sum(buffer.nbytes for buffer in result.buffers())
-    return sum(_bytes(part) for part in result) if isinstance(result, tuple) else 0
+    return sum(_bytes(value) for value in result) if isinstance(result, tuple) else 0
 
 
 def _release() -> None:

@@ -50,13 +50,13 @@ def pages(stages: Sequence[str] = tuple(HOURS), listing: bool = False, out: str 
         raise ValueError(f"`stages` must be some of {', '.join(HOURS)}, got {name}")
     folder = Path(out)
     steps = {name: commands(DOCS / f"{name}.md") for name in stages}
-    for name, found in steps.items():
+    for name, page_commands in steps.items():
         print(f"{name}: {HOURS[name]} hours, docs/{name}.md")
         if listing:
-            for step, command in numbered(name, found, folder).items():
+            for step, command in numbered(name, page_commands, folder).items():
                 print(f"  {step}: {shlex.join(command)}{' (done)' if is_done(folder / f'{step}.txt', command) else ''}")
         else:
-            perform(numbered(name, found, folder), folder)
+            perform(numbered(name, page_commands, folder), folder)
 
 
 def commands(page: Path) -> list[list[str]]:
@@ -66,10 +66,10 @@ def commands(page: Path) -> list[list[str]]:
     return [shlex.split(line, comments=True) for line in lines if re.match(r"neuroprior \w|python -m eval \w", line)]
 
 
-def numbered(page: str, found: Sequence[Sequence[str]], folder: Path) -> dict[str, list[str]]:
+def numbered(page: str, page_commands: Sequence[Sequence[str]], folder: Path) -> dict[str, list[str]]:
     """The commands of a page as `PAGE-NUMBER`, each with a folder of its own for its files."""
     steps = {}
-    for number, words in enumerate(found, 1):
+    for number, words in enumerate(page_commands, 1):
         step, kept = f"{page}-{number}", list(words)
         if "--out" in kept:
             at = kept.index("--out")

@@ -98,8 +98,8 @@ class Source:
             taken[:, t] = probs.gather(1, action)[:, 0].log()
             actions[:, t] = action[:, 0]
             history = (history * self.num_actions + action[:, 0]) % self.num_actions**self.order
-        given = None if self.context is None else context if self.context == "step" else context[:, 0]
-        return Plans(actions, self.num_actions, context=given), taken
+        plan_context = None if self.context is None else context if self.context == "step" else context[:, 0]
+        return Plans(actions, self.num_actions, context=plan_context), taken
 
     def _probs(self, actions: Tensor, context: Tensor, history: Tensor, t: int) -> Tensor:
         even = torch.full((len(actions), self.num_actions), 1 / self.num_actions, dtype=torch.double)
@@ -228,42 +228,42 @@ def long_rows(job: LongJob, number: int) -> list[dict[str, Any]]:
         job: the kind of sequences, and the seed.
         number: of sequences to learn from.
     """
-    given = sequences(number, torch.Generator().manual_seed(job.seed))[job.kind]
-    found = {name: _fit_long(given, name, job.seed) for name in OF_SEQUENCES}
+    source = sequences(number, torch.Generator().manual_seed(job.seed))[job.kind]
+    fits = {name: _fit_long(source, name, job.seed) for name in OF_SEQUENCES}
     rows = []
-    for name, (own, seconds) in found.items():
-        row = {"source": given.name, "seed": job.seed, "model": name, "entropy": given.entropy}
-        row |= {"bits_per_action": own.bits_per_action().mean, "seconds": seconds}
-        gap = own.minus(found["combined"][0])
+    for name, (fit_score, seconds) in fits.items():
+        row = {"source": source.name, "seed": job.seed, "model": name, "entropy": source.entropy}
+        row |= {"bits_per_action": fit_score.bits_per_action().mean, "seconds": seconds}
+        gap = fit_score.minus(fits["combined"][0])
         rows.append(row | dict(zip(GAP, gap, strict=True)))
     return rows
 
 
-def _fit_long(given: Sequences, name: str, seed: int) -> tuple[Score, float]:
+def _fit_long(source: Sequences, name: str, seed: int) -> tuple[Score, float]:
     """The score of a prior on the test sequences, and the seconds in which it was fitted."""
     generator, began = torch.Generator().manual_seed(seed), time.perf_counter()
     if name == MARKOV:
-        chain = best_chain([given.training.split(generator=generator)], None)
+        chain = best_chain([source.training.split(generator=generator)], None)
         assert chain is not None
-        prior: Prior = chain.fit(given.training)
+        prior: Prior = chain.fit(source.training)
     else:
         silent: dict[str, Any] = {} if name == "context-tree" else {"progress": False}
-        prior = fit(given.training, name, generator=generator, **silent)
+        prior = fit(source.training, name, generator=generator, **silent)
     seconds = time.perf_counter() - began
-    return score(name, prior, given.test), seconds
+    return score(name, prior, source.test), seconds
 
 
-def _over_seeds(rows: pd.DataFrame) -> pd.DataFrame:
+def _average_seeds(rows: pd.DataFrame) -> pd.DataFrame:
     """A row a model: of several seeds the means, and intervals over these."""
     if rows["seed"].nunique() == 1:
         return rows
     bits = rows.pivot(index="seed", columns="model", values="bits_per_action")
-    found = []
-    for name, own in rows.groupby("model", sort=False):
+    averages = []
+    for name, model_rows in rows.groupby("model", sort=False):
         gap = paired_difference(bits[name], bits["combined"])
-        means = own[["entropy", "bits_per_action", "seconds"]].mean().to_dict()
-        found.append({"model": name} | means | dict(zip(GAP, gap, strict=True)))
-    return pd.DataFrame(found)
+        means = model_rows[["entropy", "bits_per_action", "seconds"]].mean().to_dict()
+        averages.append({"model": name} | means | dict(zip(GAP, gap, strict=True)))
+    return pd.DataFrame(averages)
 
 
 def _price(rows: pd.DataFrame) -> float:
@@ -275,7 +275,7 @@ def _price(rows: pd.DataFrame) -> float:
 def _table_of_long(rows: pd.DataFrame) -> Table:
     """A row a model of one source: bits per action, how many more than those of the combined prior, and seconds."""
     units = "predicted sequences" if rows["seed"].nunique() == 1 else f"{rows['seed'].nunique()} seeds"
-    source_name, rows = rows["source"].iloc[0], _over_seeds(rows)
+    source_name, rows = rows["source"].iloc[0], _average_seeds(rows)
     columns: dict[str, Column] = {
         "prior": "model",
         "bits per action": "bits_per_action:.4f",

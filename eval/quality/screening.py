@@ -79,7 +79,7 @@ def screening(
     asked = {"command": "screening", "num_sequences": num_sequences}
     run = JobRun(partial(rows_of, num_sequences=num_sequences), Path(out) / "runs", asked)
     rows = run.do([Job(name, seed) for name in data], processes=processes, title="screening")
-    frame = pd.DataFrame(row for some in rows for row in some)
+    frame = pd.DataFrame(row for job_rows in rows for row in job_rows)
     publish(_document(frame, {"sizes": sizes, "num_sequences": num_sequences, "seed": seed}), Path(out))
 
 
@@ -100,8 +100,8 @@ def rows_of(job: Job, num_sequences: int) -> list[dict[str, Any]]:
         trained.fit(plans_for(trained, learned), generator=generator, validation=held_out, **settings)
         seconds = time.perf_counter() - screened
         joined, joined_test = (
-            torch.cat([known, stack_forecasts([trained], some)], 2)
-            for known, some in ((forecasts, held_out), (of_test, test))
+            torch.cat([forecast, stack_forecasts([trained], scored_plans)], 2)
+            for forecast, scored_plans in ((forecasts, held_out), (of_test, test))
         )
         row = {"data": job.data, "actions": int(plans.mask().sum()), "network": type(network).__name__}
         tried = all(earlier["trained"] for earlier in rows)  # up to the first that does not pay

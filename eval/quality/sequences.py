@@ -54,11 +54,11 @@ def sequences(number: int, generator: torch.Generator) -> list[Sequences]:
 
 def switching_chain(generator: torch.Generator) -> Tensor:
     """`[CONDITIONS, KINDS, KINDS]`: the probability of each action after each other one, in each condition."""
-    shared, own = (
+    shared, of_condition = (
         torch.randn(KINDS, KINDS, generator=generator),
         torch.randn(CONDITIONS, KINDS, KINDS, generator=generator),
     )
-    return (shared + 2 * own).double().softmax(-1)
+    return (shared + 2 * of_condition).double().softmax(-1)
 
 
 def draw(table: Tensor, number: int, generator: torch.Generator) -> tuple[Plans, Tensor]:

@@ -159,7 +159,7 @@ def p_values(plans: RecordedPlans, permutations: int, generator: torch.Generator
     conditions = compare_conditions(plans, permutations, generator)
     survival = duration_survival(plans, permutations, generator)
     apart = bits.masked_fill(~mask, 0).sum(1).div(mask.sum(1))
-    found = {
+    by_test = {
         "transitions, of subjects": within.p_value,
         "transitions, of conditions": between.p_value,
         "transitions, any cell": _least(between.cell_p_values),
@@ -173,10 +173,10 @@ def p_values(plans: RecordedPlans, permutations: int, generator: torch.Generator
         "types": 0.0 if plans.group is not None and individual_types(plans, generator).number > 1 else 1.0,
     }
     if (order := by_plan(plans, bits, mask).trend) is not None:
-        found["trend over sequences"] = order.p_value
+        by_test["trend over sequences"] = order.p_value
     if (differ := by_group(plans, bits, mask).p_value) is not None and bool(apart.isfinite().all()):
-        found["bits, of subjects"] = differ
-    return found
+        by_test["bits, of subjects"] = differ
+    return by_test
 
 
 def intervals(plans: RecordedPlans, permutations: int, generator: torch.Generator) -> dict[str, tuple[float, ...]]:
@@ -185,30 +185,32 @@ def intervals(plans: RecordedPlans, permutations: int, generator: torch.Generato
     bits, after_first = action_bits(prior, plans), mask & (torch.arange(LENGTH) > 0)
     within, conditions = transitions(plans, 1, generator), compare_conditions(plans, permutations, generator)
     between = transitions(plans, 1, generator, by="condition")
-    found = {f"transition 0 to {to}": _cell(within, 0, to) for to in (1, 3)}
-    found["transition 0 to 1, treated"] = _cell(between, 2, 1)
+    estimates = {f"transition 0 to {to}": _cell(within, 0, to) for to in (1, 3)}
+    estimates["transition 0 to 1, treated"] = _cell(between, 2, 1)
     for family, feature in (("actions", (1,)), ("transitions", (0, 1)), ("durations", (1,))):
         for one in conditions.families:
             at = [place for place, parts in enumerate(one.features.tolist()) if tuple(parts) == feature]
             if one.name == family and at:
-                found[f"difference, {family}"] = tuple(one.difference[:, at[0]].tolist())
-                found[f"treated, {family}"] = tuple(float(ends[1, at[0]]) for ends in (one.means, one.low, one.high))
+                estimates[f"difference, {family}"] = tuple(one.difference[:, at[0]].tolist())
+                estimates[f"treated, {family}"] = tuple(
+                    float(ends[1, at[0]]) for ends in (one.means, one.low, one.high)
+                )
     survival = duration_survival(plans, permutations, generator)
     if "1" in survival.ratios:
-        found["survival, times as long"] = tuple(survival.ratios["1"])
+        estimates["survival, times as long"] = tuple(survival.ratios["1"])
     curve = survival.curves["1", "saline"]
     late = int(np.searchsorted(curve.time, 1.5)) - 1
-    found["survival after 1.5 s"] = (float(curve.survival[late]), float(curve.low[late]), float(curve.high[late]))
+    estimates["survival after 1.5 s"] = (float(curve.survival[late]), float(curve.low[late]), float(curve.high[late]))
     for motif in motifs(plans, (3,)):
         if motif.actions in ((0, 1, 2), (1, 1, 1)):
-            found["motif " + " ".join(map(str, motif.actions))] = (motif.ratio, motif.low, motif.high)
+            estimates["motif " + " ".join(map(str, motif.actions))] = (motif.ratio, motif.low, motif.high)
     drift = rate_drift(plans)
-    found["drift of behaviour 0"] = drift.changes[list(drift.behaviours).index("0")][:3]
-    known = score("chain", prior, plans)
-    found["bits of a chain"] = known.bits_per_action()[:3]
-    found["bits less than another's"] = known.minus(score("shares", fixed_chain(0), plans))[:3]
-    found["trend in sequences"] = by_position(plans, bits, after_first).trend[:3]
-    return found
+    estimates["drift of behaviour 0"] = drift.changes[list(drift.behaviours).index("0")][:3]
+    chain_score = score("chain", prior, plans)
+    estimates["bits of a chain"] = chain_score.bits_per_action()[:3]
+    estimates["bits less than another's"] = chain_score.minus(score("shares", fixed_chain(0), plans))[:3]
+    estimates["trend in sequences"] = by_position(plans, bits, after_first).trend[:3]
+    return estimates
 
 
 def _cell(result: Any, group: int, to: int) -> tuple[float, ...]:
@@ -217,8 +219,8 @@ def _cell(result: Any, group: int, to: int) -> tuple[float, ...]:
 
 
 def _least(values: torch.Tensor) -> float:
-    known = values[~values.isnan()]
-    return float(known.min()) if len(known) else np.nan
+    finite = values[~values.isnan()]
+    return float(finite.min()) if len(finite) else np.nan
 
 
 @claim_out
@@ -253,15 +255,15 @@ def calibration(
         for design in DESIGNS
         for effect in (False, True)
     ]
-    found = run.do(jobs, processes=processes, dask=dask, title="studies")
+    results = run.do(jobs, processes=processes, dask=dask, title="studies")
     rows = []
-    for job, some in zip(jobs, found, strict=True):
-        for kind, name, *values in some:
-            known = {"design": job.design, "effect": job.effect, "kind": kind, "name": name}
+    for job, job_results in zip(jobs, results, strict=True):
+        for kind, name, *values in job_results:
+            labels = {"design": job.design, "effect": job.effect, "kind": kind, "name": name}
             if kind == "test":
-                rows.append(known | {"hit": values[0] is not None and values[0] <= LEVEL})
+                rows.append(labels | {"hit": values[0] is not None and values[0] <= LEVEL})
             elif (true := truth[Batch(job.design, job.effect, 0)].get(name)) is not None:
-                rows.append(known | {"hit": values[1] is None or values[2] is None or values[1] <= true <= values[2]})
+                rows.append(labels | {"hit": values[1] is None or values[2] is None or values[1] <= true <= values[2]})
     frame = pd.DataFrame(rows).groupby(["kind", "name", "effect", "design"], sort=False)["hit"].agg(["sum", "size"])
     shares = [share_interval(int(hits), int(size)) for hits, size in frame.to_numpy()]
     columns = {"studies": frame["size"].to_numpy(), "share": [one.mean for one in shares]}

@@ -95,8 +95,8 @@ def study(
             for number in range(-(-(with_effect if effect else studies) // TOGETHER))
         ]
         run = JobRun(partial(compared, numbers), folder, numbers)
-        found = run.do(jobs, processes=processes, dask=dask, title="studies")
-        rows = [asdict(job) | row for job, some in zip(jobs, found, strict=True) for row in some]
+        job_rows = run.do(jobs, processes=processes, dask=dask, title="studies")
+        rows = [asdict(job) | row for job, batch in zip(jobs, job_rows, strict=True) for row in batch]
         frame = pd.DataFrame(
             rows, columns=["design", "effect", "kind", "study", "level", "test", "p", "corrected", "feature"]
         )
@@ -159,9 +159,9 @@ def _shares(tests: pd.DataFrame) -> pd.DataFrame:
     `level` is the largest p-value below 0.05 that is possible. All shares have Wilson's interval.
     """
     rows = []
-    for (design, test), own in tests.groupby(["design", "test"], sort=False):
-        null, effect = own[~own["effect"]], own[own["effect"]]
-        row = {"design": design, "test": test, "level": own["level"].iloc[0], "studies": len(null)}
+    for (design, test), design_tests in tests.groupby(["design", "test"], sort=False):
+        null, effect = design_tests[~design_tests["effect"]], design_tests[design_tests["effect"]]
+        row = {"design": design, "test": test, "level": design_tests["level"].iloc[0], "studies": len(null)}
         for name, p_values in (("alarms", null["p"]), ("power", effect["corrected"])):
             values = share_interval(int((p_values < LEVEL).sum()), len(p_values))
             row |= dict(zip((name, f"{name}_low", f"{name}_high"), values, strict=True))
@@ -169,17 +169,21 @@ def _shares(tests: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _features(found: pd.DataFrame, studies: int) -> pd.DataFrame:
+def _features(features: pd.DataFrame, studies: int) -> pd.DataFrame:
     """In how many studies with an effect each changed feature is found, and any transition or duration that is not."""
-    own = found[found["effect"] & found["test"].isin(["transitions", "durations"])]
-    own = own.assign(planted=(own["test"] + " " + own["feature"]).isin([" ".join(words) for words in PLANTED]))
+    candidates = features[features["effect"] & features["test"].isin(["transitions", "durations"])]
+    candidates = candidates.assign(
+        planted=(candidates["test"] + " " + candidates["feature"]).isin([" ".join(words) for words in PLANTED])
+    )
     rows = []
     for design in DESIGNS:
-        some = own[own["design"] == design]
+        in_design = candidates[candidates["design"] == design]
         for test, *names in sorted(PLANTED):
-            here = some[(some["test"] == test) & (some["feature"] == " ".join(names))]
-            rows.append((design, f"{test}: {' '.join(names)}", True, here["study"].nunique()))
-        rows.append((design, "any other transition or duration", False, some[~some["planted"]]["study"].nunique()))
+            matching = in_design[(in_design["test"] == test) & (in_design["feature"] == " ".join(names))]
+            rows.append((design, f"{test}: {' '.join(names)}", True, matching["study"].nunique()))
+        rows.append(
+            (design, "any other transition or duration", False, in_design[~in_design["planted"]]["study"].nunique())
+        )
     frame = pd.DataFrame(rows, columns=["design", "feature", "planted", "found"])
     shares = pd.DataFrame([share_interval(number, studies)._asdict() for number in frame["found"]])
     shares = shares.rename(columns={"mean": "power", "low": "power_low", "high": "power_high"})

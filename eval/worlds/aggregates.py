@@ -48,8 +48,8 @@ def mean_intervals(frame: pd.DataFrame, by: str | Sequence[str], value: str) -> 
         of units. `low` and `high` are NaN for fewer than two units.
     """
     by = [by] if isinstance(by, str) else list(by)
-    found = frame.groupby(by, sort=False, dropna=False)[value].agg(mean="mean", error="sem", n="count")
-    half = special.stdtrit(found["n"] - 1, 0.975) * found["error"]
-    found = found.assign(low=found["mean"] - half, high=found["mean"] + half)
-    columns: pd.DataFrame = found[["mean", "low", "high", "n"]].reset_index()
+    means = frame.groupby(by, sort=False, dropna=False)[value].agg(mean="mean", error="sem", n="count")
+    half = special.stdtrit(means["n"] - 1, 0.975) * means["error"]
+    means = means.assign(low=means["mean"] - half, high=means["mean"] + half)
+    columns: pd.DataFrame = means[["mean", "low", "high", "n"]].reset_index()
     return columns

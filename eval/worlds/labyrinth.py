@@ -92,14 +92,14 @@ def shares_reached(
         `[T, P]`, float64.
     """
     most, ends = planner.num_plans, torch.tensor(lengths) - 1
-    found = torch.empty(len(start), most, len(lengths), dtype=torch.bool)
+    reached = torch.empty(len(start), most, len(lengths), dtype=torch.bool)
     size = max(ROWS // most, 1)
     for at in range(0, len(start), size):
         _, score, _ = planner.candidates(world, start[at : at + size], generator)
-        found[at : at + size] = score[..., ends] > 0
+        reached[at : at + size] = score[..., ends] > 0
     shares = []
     for number in num_plans:
         blocks = most // number
-        block = found[:, : blocks * number].view(len(start), blocks, number, len(lengths))
+        block = reached[:, : blocks * number].view(len(start), blocks, number, len(lengths))
         shares.append(block.any(2).double().mean((0, 1)))
     return torch.stack(shares, 1)

@@ -101,17 +101,17 @@ def run_experiment(
 
 def command_line(command: str) -> str:
     """What was typed to run an experiment, or its command alone where it was called from Python."""
-    given = sys.argv[1:] if sys.argv[1:2] == [command] else [command]
-    return "python -m eval " + shlex.join(given)
+    words = sys.argv[1:] if sys.argv[1:2] == [command] else [command]
+    return "python -m eval " + shlex.join(words)
 
 
 def check_distinct(**options: Sequence[Any]) -> None:
     """Raise ValueError, naming the option, where a list is empty or holds something twice."""
-    for name, given in options.items():
-        if not given:
+    for name, values in options.items():
+        if not values:
             raise ValueError(f"`{name}` must have at least one")
-        if len(set(given)) < len(given):
-            raise ValueError(f"{name}: each may be given once, not {' '.join(map(str, given))}")
+        if len(set(values)) < len(values):
+            raise ValueError(f"{name}: each may be given once, not {' '.join(map(str, values))}")
 
 
 def frame_of(results: Sequence[Mapping[str, Any]], key: str = "entries") -> pd.DataFrame:
@@ -125,9 +125,9 @@ def seed_means(frame: pd.DataFrame, by: Sequence[str], value: str, others: Seque
     Returns:
         A row for each group: columns `by`, `value` with its interval (`low`, `high`), the number of `seeds`, `others`.
     """
-    found: pd.DataFrame = mean_intervals(frame, by, value).rename(columns={"mean": value, "n": "seeds"})
+    intervals: pd.DataFrame = mean_intervals(frame, by, value).rename(columns={"mean": value, "n": "seeds"})
     means = frame.groupby(list(by), sort=False, dropna=False)[list(others)].mean()
-    return found.join(means.reset_index(drop=True))
+    return intervals.join(means.reset_index(drop=True))
 
 
 def paired_differences(pairs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
@@ -142,12 +142,12 @@ def paired_differences(pairs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
         two-sided test, and `p_holm`, corrected for all tests in the same world.
     """
     rows = [
-        (*place, *paired_difference(own["first"], own["second"]))
-        for place, own in pairs.groupby(list(by), sort=False)
-        if len(own) > 1
+        (*place, *paired_difference(group["first"], group["second"]))
+        for place, group in pairs.groupby(list(by), sort=False)
+        if len(group) > 1
     ]
-    found = pd.DataFrame(rows, columns=[*by, "difference", "low", "high", "p_value"])
-    return found.assign(p_holm=found.groupby("world")["p_value"].transform(holm))
+    gaps = pd.DataFrame(rows, columns=[*by, "difference", "low", "high", "p_value"])
+    return gaps.assign(p_holm=gaps.groupby("world")["p_value"].transform(holm))
 
 
 def across_worlds(pairs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
@@ -164,8 +164,8 @@ def across_worlds(pairs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
         with its `_low` and `_high`.
     """
     rows = []
-    for place, own in pairs.groupby(list(by), sort=False):
-        first, second = (own.pivot(index="world", columns="seed", values=side) for side in ("first", "second"))
+    for place, group in pairs.groupby(list(by), sort=False):
+        first, second = (group.pivot(index="world", columns="seed", values=side) for side in ("first", "second"))
         seeds = first.columns[first.notna().all() & second.notna().all()]
         if len(first) > 1 and len(seeds) > 1:
             a, b = first[seeds].to_numpy(), second[seeds].to_numpy()
@@ -229,13 +229,13 @@ def difference_table(
 
 
 def across_table(
-    found: pd.DataFrame, names: Mapping[str, Column], first: str, second: str, unit: str, factor: float, how: str = ""
+    across: pd.DataFrame, names: Mapping[str, Column], first: str, second: str, unit: str, factor: float, how: str = ""
 ) -> Table:
     """`across_worlds` as a table; `names`: the columns that name a row, by heading; `first`, `second`: headings.
 
     `how` goes into its title. The number of worlds has a column where it differs.
     """
-    numbers = found["worlds"].unique()
+    numbers = across["worlds"].unique()
     title = f"Over {numbers[0]} worlds" if len(numbers) == 1 else "Over worlds"
     columns = dict(names) | ({"worlds": "worlds"} if len(numbers) > 1 else {})
     columns |= {
@@ -249,7 +249,7 @@ def across_table(
         " improvement in a world drawn at random;"
         " Student's 95 % intervals over seeds."
     )
-    return table(found, columns, caption, f"{title}{how}", "l" * len(names) + "r" * (len(columns) - len(names)))
+    return table(across, columns, caption, f"{title}{how}", "l" * len(names) + "r" * (len(columns) - len(names)))
 
 
 def over_seeds(rows: pd.DataFrame) -> str:

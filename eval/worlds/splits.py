@@ -49,7 +49,7 @@ class Worlds(NamedTuple):
 
 def from_seeds(seed: int, make: Callable[..., World], **how: Any) -> Worlds:
     """Three worlds made by `make(seed=..., **how)`, each with a seed of its own."""
-    return Worlds(*(make(seed=len(Worlds._fields) * seed + part, **how) for part in range(len(Worlds._fields))))
+    return Worlds(*(make(seed=len(Worlds._fields) * seed + number, **how) for number in range(len(Worlds._fields))))
 
 
 def grid_layouts(seed: int, make: Callable[..., World], **how: Any) -> Worlds:
@@ -64,8 +64,8 @@ def split_starts(seed: int, name: str) -> Worlds:
     where = world.starts.nonzero()[:, 0]
     where = where[torch.randperm(len(where), generator=torch.Generator().manual_seed(seed))]
     parts = [copy(world) for _ in Worlds._fields]
-    for part, kept in zip(parts, where.tensor_split([len(where) // 2, 3 * len(where) // 4]), strict=True):
-        part.starts = torch.zeros_like(world.starts).index_fill(0, kept, 1 / len(kept))
+    for split, kept in zip(parts, where.tensor_split([len(where) // 2, 3 * len(where) // 4]), strict=True):
+        split.starts = torch.zeros_like(world.starts).index_fill(0, kept, 1 / len(kept))
     return Worlds(*parts)
 
 
@@ -88,11 +88,11 @@ class _Scrambles(PocketCube):
         self.quarters = torch.tensor(quarters)
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
-        own = torch.zeros(0, dtype=torch.long)
-        while len(own) < batch_size:
+        states = torch.zeros(0, dtype=torch.long)
+        while len(states) < batch_size:
             state = super().reset(4 * batch_size + 100, generator)
-            own = torch.cat([own, state[torch.isin((state * 2_654_435_761 >> 8) % 4, self.quarters)]])
-        return own[:batch_size]
+            states = torch.cat([states, state[torch.isin((state * 2_654_435_761 >> 8) % 4, self.quarters)]])
+        return states[:batch_size]
 
 
 def scrambled_cubes(seed: int) -> Worlds:
