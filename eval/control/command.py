@@ -117,8 +117,8 @@ def control_experiment(
         return run.do(jobs, processes=processes, dask=dask, title=what)
 
     def tuned(jobs: Sequence[Tuning]) -> dict[tuple[str, str, str], Choice]:
-        found = done("tuning", tuning_run, jobs)
-        return {(job.world, job.planner, job.prior): Choice(*each) for job, each in zip(jobs, found, strict=True)}
+        chosen = done("tuning", tuning_run, jobs)
+        return {(job.world, job.planner, job.prior): Choice(*each) for job, each in zip(jobs, chosen, strict=True)}
 
     alone = tuned([Tuning(task, planner) for task in tasks for planner in dict.fromkeys(("icem", *planners))])
     learned = [prior for prior in priors if prior != NONE]

@@ -19,10 +19,10 @@ RESAMPLES = 1000
 
 def pair_by_seed(pairs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     """`runs.paired_differences`; no p-values, and so no verdict, from fewer than `ENOUGH_UNITS` seeds."""
-    found = runs.paired_differences(pairs, by)
+    gaps = runs.paired_differences(pairs, by)
     if pairs["seed"].nunique() < ENOUGH_UNITS:
-        found[["p_value", "p_holm"]] = float("nan")
-    return found
+        gaps[["p_value", "p_holm"]] = float("nan")
+    return gaps
 
 
 def differences(frame: pd.DataFrame) -> pd.DataFrame:
@@ -46,10 +46,10 @@ def savings(frame: pd.DataFrame) -> pd.DataFrame:
         that of the planner with the prior and `needed`, missing where this is infinite.
     """
     rows = []
-    for place, own in frame.groupby(["task", "condition", "planner"], sort=False):
+    for place, place_rows in frame.groupby(["task", "condition", "planner"], sort=False):
         curves = {
-            prior: [some.pivot_table(name, "seed", "budget") for name in ("return", "seconds")]
-            for prior, some in own.groupby("prior", sort=False)
+            prior: [prior_rows.pivot_table(name, "seed", "budget") for name in ("return", "seconds")]
+            for prior, prior_rows in place_rows.groupby("prior", sort=False)
         }
         if NONE not in curves:
             continue
@@ -109,8 +109,8 @@ def against_simple(values: pd.DataFrame, by: Sequence[str], value: str) -> pd.Da
         As `pair_by_seed`, by `by`, `prior`, the network, and `baseline`, what it is compared with.
     """
     parts = []
-    for _, own in values.groupby(list(by), sort=False):
-        simple, networks = own[own["prior"].isin(SIMPLE)], own[own["prior"].isin([NETWORK, CLONING])]
+    for _, rows in values.groupby(list(by), sort=False):
+        simple, networks = rows[rows["prior"].isin(SIMPLE)], rows[rows["prior"].isin([NETWORK, CLONING])]
         if len(simple):
             best = str(simple.groupby("prior", sort=False)[value].mean().idxmax())
             second = networks["seed"].map(simple[simple["prior"] == best].set_index("seed")[value])
@@ -121,8 +121,8 @@ def against_simple(values: pd.DataFrame, by: Sequence[str], value: str) -> pd.Da
 
 def over_budgets(frame: pd.DataFrame) -> pd.DataFrame:
     """The mean return over the budgets that all priors have, a row a task, condition, planner, prior and seed."""
-    common = set.intersection(*(set(own["budget"]) for _, own in frame.groupby("prior")))
+    common = set.intersection(*(set(rows["budget"]) for _, rows in frame.groupby("prior")))
     place = ["world", "condition", "planner", "prior", "seed"]
     means = frame[frame["budget"].isin(common)].groupby(place, sort=False)["return"].mean()
-    found: pd.DataFrame = means.reset_index()
-    return found
+    per_seed: pd.DataFrame = means.reset_index()
+    return per_seed

@@ -56,7 +56,7 @@ def control_document(results: Results, settings: Mapping[str, Any], command: str
     if len(nats):
         scored_networks = against_simple(nats, ["world"], "nats")
         nats = runs.seed_means(nats.assign(task=nats["world"]), ["task", "prior"], "nats", ["fit_seconds"])
-    tables = [saving_table(some) for _, some in saved.groupby("planner", sort=False)]
+    tables = [saving_table(group) for _, group in saved.groupby("planner", sort=False)]
     sections = [Section("Candidates saved", tables=tables)]
     tables = [likelihood_table(nats)] if len(nats) else []
     tables += [nats_table(scored_networks)] if len(scored_networks) else []
@@ -64,19 +64,19 @@ def control_document(results: Results, settings: Mapping[str, Any], command: str
     sections += [Section("Sequence models", tables=tables)] if tables else []
     leads, seeds = [], frame["seed"].nunique()
     for task in rows["task"].unique():
-        own = rows[rows["task"] == task]
+        task_rows = rows[rows["task"] == task]
         places = ["condition", "planner"]
-        tables = [return_table(some, TASKS[task].about) for _, some in own.groupby(places, sort=False)]
-        tables += [gap_table(some) for _, some in gaps[gaps["world"] == task].groupby(places, sort=False)]
+        tables = [return_table(group, TASKS[task].about) for _, group in task_rows.groupby(places, sort=False)]
+        tables += [gap_table(group) for _, group in gaps[gaps["world"] == task].groupby(places, sort=False)]
         boxes = [
             FigureBox(
-                return_figure(own[own["planner"] == planner]),
+                return_figure(task_rows[task_rows["planner"] == planner]),
                 f"{TASKS[task].about}. Bands: Student's 95 % intervals over seeds. {planner}, with candidates of each"
                 " prior.",
                 f"The return in {task} against the number of candidates, a line a prior; the numbers are in tables.",
                 f"{task}-{planner}",
             )
-            for planner in own["planner"].unique()
+            for planner in task_rows["planner"].unique()
         ]
         sections.append(Section(task, tables=tables, figures=boxes))
         if len(gaps) and seeds >= ENOUGH_UNITS:
@@ -193,11 +193,11 @@ def return_figure(rows: pd.DataFrame) -> Figure:
     budgets = sorted(rows["budget"].unique())
     budgets = [one for one, more in zip(budgets, [*budgets[1:], np.inf], strict=True) if more >= MIN_LABEL_RATIO * one]
     for panel, condition in zip(axes, conditions, strict=True):
-        here = rows[rows["condition"] == condition]
-        for prior in here["prior"].unique():
-            own = here[here["prior"] == prior].sort_values("budget")
+        condition_rows = rows[rows["condition"] == condition]
+        for prior in condition_rows["prior"].unique():
+            curve = condition_rows[condition_rows["prior"] == prior].sort_values("budget")
             color, style = LINES[prior]
-            band(panel, own[["budget", "return", "low", "high"]].to_numpy(float), color, prior, style)
+            band(panel, curve[["budget", "return", "low", "high"]].to_numpy(float), color, prior, style)
         panel.set_xscale("log")
         panel.set_xticks(budgets, [f"{budget:,}" for budget in budgets])
         panel.minorticks_off()

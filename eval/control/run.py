@@ -168,8 +168,8 @@ class Planning(NamedTuple):
 def generator_of(settings: ControlSettings, seed: int, *place: object) -> torch.Generator:
     """The generator of one use of a seed: contestants of equal seeds meet equal starts, and are independent else."""
     number = (settings.seed * 1_000_003 + seed) * 1_000_003
-    for part in place:
-        for letter in str(part):
+    for name in place:
+        for letter in str(name):
             number = (number * 31 + ord(letter)) % 2**61
     return torch.Generator().manual_seed(number)
 

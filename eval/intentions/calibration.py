@@ -52,12 +52,12 @@ def filled_bins(sums: Tensor) -> list[Bin]:
     Args:
         sums: as in `calibration_error`.
     """
-    found = []
-    for own in sums.unbind(1):
-        forecast, true, number = own[own[:, 2] > 0].T
+    bins = []
+    for bin_sums in sums.unbind(1):
+        forecast, true, number = bin_sums[bin_sums[:, 2] > 0].T
         if len(number):
-            found.append(Bin(float(forecast.sum() / number.sum()), _share(true, number)))
-    return found
+            bins.append(Bin(float(forecast.sum() / number.sum()), _share(true, number)))
+    return bins
 
 
 def _share(true: Tensor, number: Tensor) -> Interval:

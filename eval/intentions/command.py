@@ -63,13 +63,13 @@ def intentions(
         "goals": (2, 32),
         "num_plans": (2, 4096),
     }
-    for name, given in (("observed", observed), ("ahead", ahead), ("goals", [goals]), ("num_plans", num_plans)):
+    for name, values in (("observed", observed), ("ahead", ahead), ("goals", [goals]), ("num_plans", num_plans)):
         low, high = limits[name]
-        if wrong := [number for number in given if not low <= number <= high]:
+        if wrong := [number for number in values if not low <= number <= high]:
             raise ValueError(f"`{name}` must be integers from {low} to {high}, got {wrong[0]}")
     if LABYRINTH in worlds and seeds > BLOCKS:
         raise ValueError(f"seeds: in the {LABYRINTH} at most {BLOCKS}, the blocks of sequences, not {seeds}")
-    numbers, times, later = (tuple(sorted(given)) for given in (num_plans, observed, ahead))
+    numbers, times, later = (tuple(sorted(values)) for values in (num_plans, observed, ahead))
     settings = IntentionSettings(goals, numbers, agents, times, later, temperature, seed)
     how = worlds, seeds, out, processes, dask
     document = runs.run_experiment("intentions", intentions_run, intentions_document, settings, *how)

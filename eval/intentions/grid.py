@@ -179,18 +179,18 @@ def learned(
     closed = replace(plans, actions=actions, lengths=(taught.length + 1).clamp(max=LONGEST))
     closed = closed.steps(stop=int(taught.length.max()) + 1)
     for number, kind in product(settings.num_plans, ORDERS):
-        some, contexts = place < number, scene.world.num_states if kind == "cell" else None
-        held_out = some & (place >= number - max(round(VALIDATION * number), 1))
-        own, best = closed if contexts else closed.without_context(), []
+        taken, contexts = place < number, scene.world.num_states if kind == "cell" else None
+        held_out = taken & (place >= number - max(round(VALIDATION * number), 1))
+        walks, best = closed if contexts else closed.without_context(), []
         for k in range(settings.goals):
-            counted, others = (own[(taught.goal == k) & part] for part in (some & ~held_out, held_out))
+            counted, others = (walks[(taught.goal == k) & mask] for mask in (taken & ~held_out, held_out))
             tried = [Chains(counted, order, contexts) for order in ORDERS[kind]]
             likelihoods = torch.stack([chains.log_likelihood(others) for chains in tried])
             order, back_off = divmod(int(likelihoods.argmax()), likelihoods.shape[1])
             best.append(tried[order].chain(back_off))
         posterior = infer(best, closed[held_out]).log_probs
         power = Agents(taught.goal[held_out], taught.length[held_out]).best_scale(posterior, settings.observed)
-        yield Key(kind, number), [prior.fit(own[(taught.goal == k) & some]) for k, prior in enumerate(best)], power
+        yield Key(kind, number), [prior.fit(walks[(taught.goal == k) & taken]) for k, prior in enumerate(best)], power
 
 
 def progress(distance: Tensor, cells: Tensor) -> Tensor:
@@ -210,15 +210,15 @@ def grid_entries(world: str, settings: IntentionSettings, generator: torch.Gener
     training, trained, taught = walks(torch.arange(settings.goals).repeat_interleave(max(settings.num_plans)))
     plans, cells, seen = walks(torch.randint(settings.goals, (settings.agents,), generator=generator))
     priors: dict[Key, list[Prior]] = {Key("exact", 0): [*map(policy_prior, scene.policies)]}
-    found = {Key("uniform", 0): torch.zeros(settings.agents, LONGEST + 1, settings.goals).double()}
+    all_logits = {Key("uniform", 0): torch.zeros(settings.agents, LONGEST + 1, settings.goals).double()}
     for name, table in (("path", scene.path), ("straight", scene.straight)):
         scale = taught.best_scale(progress(table, trained), settings.observed)
-        found[Key(name, 0)] = scale * progress(table, cells)
-    found[Key("exact", 0)] = infer(priors[Key("exact", 0)], plans).log_probs
-    for key, own, power in learned(scene, taught, training, settings):
-        priors[key], found[key] = own, infer(own, plans).log_probs
-        found[Key(f"{key.kind}, tempered", key.plans)] = power * found[key]
-    for key, logits in found.items():
+        all_logits[Key(name, 0)] = scale * progress(table, cells)
+    all_logits[Key("exact", 0)] = infer(priors[Key("exact", 0)], plans).log_probs
+    for key, goal_priors, power in learned(scene, taught, training, settings):
+        priors[key], all_logits[key] = goal_priors, infer(goal_priors, plans).log_probs
+        all_logits[Key(f"{key.kind}, tempered", key.plans)] = power * all_logits[key]
+    for key, logits in all_logits.items():
         named = key._asdict()
         for row in seen.scores(logits, settings.observed):
             yield named | {"measure": "moves"} | row
@@ -229,14 +229,14 @@ def grid_entries(world: str, settings: IntentionSettings, generator: torch.Gener
         if len(there):
             now = logits[there, torch.tensor(settings.observed)[time]].log_softmax(-1)
             yield named | {"measure": "calibration", "sums": count_forecasts(now, seen.goal[there]).tolist()}
-    yield from _switched(scene, priors, settings, generator)
+    yield from _switch_entries(scene, priors, settings, generator)
     mid_plan = (seen.length >= FORECAST_AFTER).nonzero()[:FORECASTED, 0]
     if len(mid_plan):
-        posteriors = {key: found[key][mid_plan, FORECAST_AFTER].exp() for key in priors}
+        posteriors = {key: all_logits[key][mid_plan, FORECAST_AFTER].exp() for key in priors}
         yield from _forecasts(scene, priors, posteriors, cells[mid_plan, FORECAST_AFTER:], settings.ahead, generator)
 
 
-def _switched(
+def _switch_entries(
     scene: Scene, priors: Mapping[Key, list[Prior]], settings: IntentionSettings, generator: torch.Generator
 ) -> Iterator[dict[str, Any]]:
     """The same of agents that turn to another goal after `SWITCH_AT` moves, and have not reached the first by then."""
@@ -245,9 +245,9 @@ def _switched(
     plans, _ = walk(scene, torch.where(torch.arange(LONGEST) < SWITCH_AT, first[:, None], second[:, None]), generator)
     length = plans.mask().sum(1)
     kept = length >= SWITCH_AT
-    for key, own in priors.items():
+    for key, goal_priors in priors.items():
         for switch in (0.0, SWITCH):
-            logits = infer(own, plans, switch=switch).log_probs[kept]
+            logits = infer(goal_priors, plans, switch=switch).log_probs[kept]
             # After the last move before, the goal is still the first.
             rows = Agents(first[kept], length[kept]).scores(logits, (SWITCH_AT,))
             rows += Agents(second[kept], length[kept]).scores(logits, tuple(SWITCH_AT + t for t in settings.observed))
@@ -270,12 +270,12 @@ def _forecasts(
     steps.scatter_add_(2, scene.world.next_state.expand(scene.policies.shape), scene.policies)
     for ahead in times:
         exact = (steps.matrix_power(ahead)[:, now] * posteriors[Key("exact", 0)].T[..., None]).sum(0)
-        found = {Key("exact", 0): exact, Key("uniform", 0): torch.full_like(exact, 1 / size)}
-        for key, own in priors.items():
+        forecasts = {Key("exact", 0): exact, Key("uniform", 0): torch.full_like(exact, 1 / size)}
+        for key, goal_priors in priors.items():
             share, seen = torch.zeros_like(exact), posteriors[key]
-            share[:, scene.free] = forecast(own, scene.world, now, seen, ahead, SAMPLES, scene.free, generator)
+            share[:, scene.free] = forecast(goal_priors, scene.world, now, seen, ahead, SAMPLES, scene.free, generator)
             name = key._replace(kind="exact, sampled") if key.kind == "exact" else key
-            found[name] = (1 - FLOOR) * share + FLOOR / size
-        for key, probs in found.items():
+            forecasts[name] = (1 - FLOOR) * share + FLOOR / size
+        for key, probs in forecasts.items():
             loss = float(-probs.gather(1, cells[:, ahead, None]).log().mean())
             yield key._asdict() | {"measure": "cell", "at": ahead, "agents": len(now), "loss": loss}

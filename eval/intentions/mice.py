@@ -53,23 +53,23 @@ def stretches(plans: Plans, arrives: Tensor) -> tuple[Plans, Plans]:
     assert plans.context is not None
     length = arrives.shape[1]
     leads = arrives_within(torch.cat([arrives, arrives.new_zeros(len(arrives), STRETCH - 1)], 1), STRETCH)
-    known = leads | (torch.arange(length) <= length - STRETCH)
+    observed = leads | (torch.arange(length) <= length - STRETCH)
     new = torch.ones_like(leads)
-    new[:, 1:] = (leads[:, 1:] != leads[:, :-1]) | (known[:, 1:] != known[:, :-1]) | arrives[:, :-1]
+    new[:, 1:] = (leads[:, 1:] != leads[:, :-1]) | (observed[:, 1:] != observed[:, :-1]) | arrives[:, :-1]
     first = new.flatten().nonzero()[:, 0]
     sizes = torch.cat([first, torch.tensor([leads.numel()])]).diff()
     actions, nodes = (values.flatten().split(sizes.tolist()) for values in (plans.actions, plans.context))
     every = Plans(pad_sequence(actions, True), plans.num_actions, sizes, context=pad_sequence(nodes, True))
-    leads, known = leads.flatten()[first], known.flatten()[first]
-    return every[leads], every[known & ~leads]
+    leads, observed = leads.flatten()[first], observed.flatten()[first]
+    return every[leads], every[observed & ~leads]
 
 
 def log_odds(learned: Plans, plans: Plans) -> Tensor:
     """The posterior log-odds `[N, L + 1]` that a mouse is on its way to the water, given the moves before."""
     parts = stretches(learned, arrivals(learned))
     priors = [MarkovPrior(p.num_actions, ORDER, num_contexts=labyrinth().num_states).fit(p) for p in parts]
-    found = infer(priors, plans, weights=[float(p.mask().sum()) for p in parts], switch=1 / STRETCH).log_probs
-    return found[..., 0] - found[..., 1]
+    posterior = infer(priors, plans, weights=[float(p.mask().sum()) for p in parts], switch=1 / STRETCH).log_probs
+    return posterior[..., 0] - posterior[..., 1]
 
 
 def mode_weights(learned: Plans, plans: Plans) -> tuple[Tensor, Tensor]:
@@ -89,24 +89,26 @@ def features_of(
     not count, nor its last ones.
     """
     truth, keys = [], []
-    for own in (learned, plans):
-        assert own.context is not None
-        truth.append(arrives_within(arrivals(own), number)[:, 1:].double())
-        node = own.context[:, 1 : 1 + truth[-1].shape[1]].long()
-        keys.append((node, own.num_actions * node + own.actions[:, : node.shape[1]]))
+    for sequences in (learned, plans):
+        assert sequences.context is not None
+        truth.append(arrives_within(arrivals(sequences), number)[:, 1:].double())
+        node = sequences.context[:, 1 : 1 + truth[-1].shape[1]].long()
+        keys.append((node, sequences.num_actions * node + sequences.actions[:, : node.shape[1]]))
     times, columns = truth[0].shape[1], []
     share = truth[0].mean().expand(truth[1].shape)
-    for own, others in zip(*keys, strict=True):
+    for train_keys, others in zip(*keys, strict=True):
         size = learned.num_actions * labyrinth().num_states
-        total, found = (own.flatten().bincount(values, minlength=size) for values in (None, truth[0].flatten()))
-        share = (found[others] + SMOOTHING * share) / (total[others] + SMOOTHING)
+        total, arrived = (
+            train_keys.flatten().bincount(values, minlength=size) for values in (None, truth[0].flatten())
+        )
+        share = (arrived[others] + SMOOTHING * share) / (total[others] + SMOOTHING)
         columns.append(share.logit())
     before, now = (weights[:, :times] for weights in modes)
     counts = torch.zeros(2, labyrinth().num_states, before.shape[-1], dtype=torch.double)
     for count, weights in zip(counts, (before, before * truth[0][..., None]), strict=True):
         count.index_add_(0, keys[0][0].flatten(), weights.flatten(0, 1))
-    total, found = (values[keys[1][0]] for values in counts)
-    by_mode = (found + SMOOTHING * columns[0].sigmoid()[..., None]) / (total + SMOOTHING)
+    total, arrived = (values[keys[1][0]] for values in counts)
+    by_mode = (arrived + SMOOTHING * columns[0].sigmoid()[..., None]) / (total + SMOOTHING)
     columns += [posterior[:, 1 : 1 + times], (now * by_mode).sum(-1).logit()]
     return torch.stack(columns, -1), truth[1]
 
@@ -129,11 +131,11 @@ def mice_entries(block: int, numbers: tuple[int, ...]) -> Iterator[dict[str, Any
     learned, test = plans[~held_out], plans[held_out]
     inner = torch.arange(len(learned)) * INNER // len(learned)
     folds = [*((learned[inner != k], learned[inner == k]) for k in range(INNER)), (learned, test)]
-    known = [(log_odds(*fold), mode_weights(*fold)) for fold in folds]
+    inferred = [(log_odds(*fold), mode_weights(*fold)) for fold in folds]
     for number in numbers:
-        found = [features_of(*fold, number, *one) for fold, one in zip(folds, known, strict=True)]
-        rows, happened = (torch.cat([pair[k].flatten(0, 1) for pair in found[:-1]]) for k in (0, 1))
-        features, truth = found[-1]
+        pairs = [features_of(*fold, number, *one) for fold, one in zip(folds, inferred, strict=True)]
+        rows, happened = (torch.cat([pair[k].flatten(0, 1) for pair in pairs[:-1]]) for k in (0, 1))
+        features, truth = pairs[-1]
         for kind, columns in FEATURES.items():
             weights = regression(rows[:, columns], happened)
             loss = binary_cross_entropy_with_logits(features[..., columns] @ weights[:-1] + weights[-1], truth)

@@ -70,19 +70,20 @@ def intentions_document(results: Sequence[Mapping[str, Any]], settings: Mapping[
     errors = calibration_errors(counted)
     tables, leads = [], []
     for world in settings["worlds"]:
-        own, more = (one[one["world"] == world] for one in (rows, gaps))
+        means, more = (one[one["world"] == world] for one in (rows, gaps))
         for measure, score, title, factor, digits in SHOWN:
-            some, gap = own[(own["measure"] == measure) & (own["score"] == score)], more[more["measure"] == measure]
-            if len(some):
-                tables.append(shown(some, measure, "value", f"{world}: {title}", factor, digits))
+            chosen = means[(means["measure"] == measure) & (means["score"] == score)]
+            gap = more[more["measure"] == measure]
+            if len(chosen):
+                tables.append(shown(chosen, measure, "value", f"{world}: {title}", factor, digits))
             if len(gap) and (measure, score) in (("moves", "loss"), ("water", "loss")):
                 tables.append(shown(gap, measure, "difference", f"{world}: differences in {title}", factor, digits))
         if world != LABYRINTH:
             columns: dict[str, Column] = {"observer": "kind", "plans": _number}
             columns["error, %"] = lambda row: runs.plus_minus(row, "error", 100)
             caption = "Expected calibration error, all numbers of moves together; ±: jackknife over seeds."
-            some = errors[errors["world"] == world]
-            tables.append(table(some, columns, caption, f"{world}: calibration of goals"))
+            world_errors = errors[errors["world"] == world]
+            tables.append(table(world_errors, columns, caption, f"{world}: calibration of goals"))
         leads.append(finding(more, world, settings))
     grids = [world for world in settings["worlds"] if world != LABYRINTH]
     caption = f"Above: log-loss of the goal (bands: Student's 95 % intervals over seeds). Below: reliability. {WHAT}"
@@ -97,20 +98,20 @@ def intentions_document(results: Sequence[Mapping[str, Any]], settings: Mapping[
 
 def compared(scored: pd.DataFrame) -> pd.DataFrame:
     """A row for each of `PAIRS`, place and seed: their losses, `first` and `second`."""
-    some, parts = scored.dropna(subset="loss").rename(columns={"loss": "first"}), []
+    losses, parts = scored.dropna(subset="loss").rename(columns={"loss": "first"}), []
     for kind, minus in PAIRS:
         # Observers that learned from nothing are compared with all numbers of plans.
         on = ["world", "measure", "at", "seed"] + ["plans"] * (minus != "exact")
-        second = some.loc[some["kind"] == minus, [*on, "first"]].rename(columns={"first": "second"})
-        parts.append(some[some["kind"] == kind].merge(second, on=on).assign(minus=minus))
+        second = losses.loc[losses["kind"] == minus, [*on, "first"]].rename(columns={"first": "second"})
+        parts.append(losses[losses["kind"] == kind].merge(second, on=on).assign(minus=minus))
     return pd.concat(parts)
 
 
 def calibration_errors(counted: pd.DataFrame) -> pd.DataFrame:
     """The expected calibration error of each observer over all seeds, with the jackknife's interval over seeds."""
-    found = []
-    for place, own in counted.groupby(["world", "kind", "plans"], sort=False):
-        sums, number = torch.tensor(own["sums"].tolist(), dtype=torch.double), len(own)
+    rows = []
+    for place, of_seeds in counted.groupby(["world", "kind", "plans"], sort=False):
+        sums, number = torch.tensor(of_seeds["sums"].tolist(), dtype=torch.double), len(of_seeds)
         error = calibration_error(sums)
         ends = [float("nan")] * 2
         if number > 1:
@@ -118,8 +119,8 @@ def calibration_errors(counted: pd.DataFrame) -> pd.DataFrame:
             values = [number * error - (number - 1) * one for one in without]
             half = mean_interval(values).high - mean_interval(values).mean
             ends = [max(error - half, 0.0), error + half]
-        found.append((*place, error, *ends, number))
-    return pd.DataFrame(found, columns=["world", "kind", "plans", "error", "low", "high", "seeds"])
+        rows.append((*place, error, *ends, number))
+    return pd.DataFrame(rows, columns=["world", "kind", "plans", "error", "low", "high", "seeds"])
 
 
 def _number(row: Any) -> str:
@@ -138,20 +139,20 @@ def shown(rows: pd.DataFrame, measure: str, value: str, title: str, factor: floa
     names |= {"assumed": "switch"} if measure == "switched" else {}
     caption = "±: 95 % interval, paired by seed; more in paired.csv." if signed else runs.over_seeds(rows)
     what = WHAT if measure == "moves" and not signed else ""
-    some = rows.assign(at=at, number=[_number(row) for _, row in rows.iterrows()])
-    return runs.table_by(some, names, "at", cells, f"{caption} {what}".strip(), title)
+    labelled = rows.assign(at=at, number=[_number(row) for _, row in rows.iterrows()])
+    return runs.table_by(labelled, names, "at", cells, f"{caption} {what}".strip(), title)
 
 
 def finding(gaps: pd.DataFrame, world: str, settings: Mapping[str, Any]) -> str:
     """How near priors come to exact inference, or what the posterior adds, in one sentence."""
-    some = gaps[gaps["measure"].isin(["moves", "water"])]
-    if some.empty:
+    chosen = gaps[gaps["measure"].isin(["moves", "water"])]
+    if chosen.empty:
         return f"{world}: differences need at least two seeds."
-    last, most = some["at"].max(), max(settings["num_plans"])
-    tempered = some["kind"].str.endswith("tempered") & (some["minus"] == "exact") & (some["plans"] == most)
+    last, most = chosen["at"].max(), max(settings["num_plans"])
+    tempered = chosen["kind"].str.endswith("tempered") & (chosen["minus"] == "exact") & (chosen["plans"] == most)
     rows = [
         f"{row['kind']} minus {row['minus']} {runs.plus_minus(row, 'difference', 1, 4, '+')}"
-        for _, row in some[(some["at"] == last) & (tempered | (world == LABYRINTH))].iterrows()
+        for _, row in chosen[(chosen["at"] == last) & (tempered | (world == LABYRINTH))].iterrows()
     ]
     learned = "" if world == LABYRINTH else f" {most} plans toward each goal and"
     return f"{world}, log-loss after{learned} {last:.0f} moves: {'; '.join(rows)}."
@@ -167,18 +168,18 @@ def observers_figure(rows: pd.DataFrame, counted: pd.DataFrame, worlds: Sequence
         lines |= {(kind, numbers[0]): ":", (kind, numbers[-1]): "-"}
     figure, axes = panels(2, len(worlds), (WIDTH, 6.4))
     for above, below, world in zip(axes[: len(worlds)], axes[len(worlds) :], worlds, strict=True):
-        own = rows[(rows["world"] == world) & (rows["measure"] == "moves") & (rows["score"] == "loss")]
+        losses = rows[(rows["world"] == world) & (rows["measure"] == "moves") & (rows["score"] == "loss")]
         for (kind, number), style in lines.items():
             name = f"{kind}, {number} plans" if number else kind
-            some = own[(own["kind"] == kind) & (own["plans"] == number)].sort_values("at")
-            band(above, some[["at", "value", "low", "high"]].to_numpy(float), KINDS[kind], name, style)
-            here = counted[(counted["world"] == world) & (counted["kind"] == kind) & (counted["plans"] == number)]
+            curve = losses[(losses["kind"] == kind) & (losses["plans"] == number)].sort_values("at")
+            band(above, curve[["at", "value", "low", "high"]].to_numpy(float), KINDS[kind], name, style)
+            counts = counted[(counted["world"] == world) & (counted["kind"] == kind) & (counted["plans"] == number)]
             if kind in ("exact", "cell", "cell, tempered"):
-                sums = torch.tensor(here["sums"].tolist(), dtype=torch.double)
+                sums = torch.tensor(counts["sums"].tolist(), dtype=torch.double)
                 points = [[one.forecast, *one.true] for one in filled_bins(sums)]
                 band(below, points, KINDS[kind], name, style)
         above.set_xscale("log", base=2)
-        above.set_xticks(sorted(own["at"].unique()), [f"{at:.0f}" for at in sorted(own["at"].unique())])
+        above.set_xticks(sorted(losses["at"].unique()), [f"{at:.0f}" for at in sorted(losses["at"].unique())])
         above.set(title=world, ylim=(0, None))
         below.plot([0, 1], [0, 1], color="#aaaaaa", lw=1, zorder=0)
         below.set(xlim=(0, 1), ylim=(0, 1))

@@ -50,7 +50,7 @@ class ForagingOracle(Planner):
         work = self.length * 2**world.num_items * world.table.num_states * world.num_actions
         # These operations take less memory than simulator steps elsewhere.
         chunks = self.chunks(state, work // (8 * world.num_actions))
-        decision = join_decisions((self._plan(world, some, generator) for some in chunks), len(state))
+        decision = join_decisions((self._plan(world, chunk, generator) for chunk in chunks), len(state))
         return decision._replace(model_steps=work)
 
     def _plan(self, world: ForagingWorld, state: Tensor, generator: torch.Generator) -> Decision:
@@ -60,8 +60,8 @@ class ForagingOracle(Planner):
         row, now, plan = torch.arange(len(state), device=state.device), state, []
         left = (state[:, 2:] < world.num_places).long() @ bits
         for values in reversed(arriving):
-            found = values[world.table.next_state[now[:, 0]], row[:, None], left[:, None]]
-            plan.append(random_best(found, generator, world.legal_actions(now)))
+            next_values = values[world.table.next_state[now[:, 0]], row[:, None], left[:, None]]
+            plan.append(random_best(next_values, generator, world.legal_actions(now)))
             now, _ = world.step(now, plan[-1])
             left = left & ~there[row, now[:, 0]]
         plans = torch.stack(plan, 1)
@@ -77,9 +77,9 @@ class ForagingOracle(Planner):
         table, (batch, cells), discount = world.table, there.shape, float(self.discounts(torch.empty(1))[1])
         items = torch.arange(2**world.num_items, device=there.device)
         start, cell = there.nonzero(as_tuple=True)  # elsewhere nothing is gained
-        found = items & there[start, cell][:, None]
-        gain = ((found[..., None] >> torch.arange(world.num_items, device=there.device)) & 1).sum(-1).float()
-        after, value, arriving = items & ~found, torch.zeros(cells, batch, len(items), device=there.device), []
+        eaten = items & there[start, cell][:, None]
+        gain = ((eaten[..., None] >> torch.arange(world.num_items, device=there.device)) & 1).sum(-1).float()
+        after, value, arriving = items & ~eaten, torch.zeros(cells, batch, len(items), device=there.device), []
         acting = value.new_empty(
             cells * world.num_actions, batch * len(items)
         )  # allocating it anew would cost more than filling it

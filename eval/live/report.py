@@ -40,11 +40,11 @@ def live_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str, A
         )
         alt = f"Food eaten in 100 steps in {world} against time, a line a prior; the numbers are in the tables."
         boxes.append(FigureBox(live_figure(frame, world, one["period"]), caption, alt, world))
-        own = gaps[gaps["world"] == world]
-        tables.append(live_table(rows[rows["world"] == world], own))
-        if len(own):
+        world_gaps = gaps[gaps["world"] == world]
+        tables.append(live_table(rows[rows["world"] == world], world_gaps))
+        if len(world_gaps):
             names = NAMES | {"against": "against"}
-            tables.append(runs.difference_table(own, f"{world}: differences", names, "food eaten in 100 steps"))
+            tables.append(runs.difference_table(world_gaps, f"{world}: differences", names, "food eaten in 100 steps"))
     if len(across):
         tables.append(runs.across_table(across, NAMES, "agent", "random", "food eaten, % of the oracle's", 100))
     lead = runs.significance(gaps, "Food eaten in 100 steps")
@@ -69,7 +69,7 @@ def live_frame(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     frame = runs.frame_of(results)
     rewards = 100 * np.array(frame["rewards"].tolist()).reshape(len(frame), -1, PARTS)
     quarters = {"reward": rewards, "after": rewards[:, 1:, : PARTS // 4], "late": rewards[:, 1:, -PARTS // 4 :]}
-    means = {name: some.mean((1, 2)) if some.size else np.nan for name, some in quarters.items()}
+    means = {name: values.mean((1, 2)) if values.size else np.nan for name, values in quarters.items()}
     return frame.rename(columns={"warm": "warm_start"}).assign(**means)
 
 
@@ -98,16 +98,16 @@ def live_pairs(frame: pd.DataFrame) -> pd.DataFrame:
         ("random", warm & (learns != "never"), random),
         ("no warm start", warm, {"warm_start": False}),
     ):
-        own = frame[asked]
-        other = own[place].assign(**changed).merge(frame[[*place, "reward"]], "left", place)["reward"]
-        parts.append(own[place].assign(against=against, first=own["reward"], second=other.to_numpy()))
+        rows = frame[asked]
+        other = rows[place].assign(**changed).merge(frame[[*place, "reward"]], "left", place)["reward"]
+        parts.append(rows[place].assign(against=against, first=rows["reward"], second=other.to_numpy()))
     return pd.concat(parts).dropna(subset="second").sort_index(kind="stable")
 
 
 def live_table(rows: pd.DataFrame, gaps: pd.DataFrame) -> Table:
     """Rewards in one world, a row a condition."""
     against_random = gaps[gaps["against"] == "random"].assign(warm_start=True)
-    own = rows.merge(against_random[["world", *CONDITION, "p_holm"]], "left")
+    rows = rows.merge(against_random[["world", *CONDITION, "p_holm"]], "left")
     columns: dict[str, Column] = {
         **NAMES,
         "learns": lambda row: row["learns"] + ("" if row["warm_start"] else ", cold"),
@@ -121,10 +121,10 @@ def live_table(rows: pd.DataFrame, gaps: pd.DataFrame) -> Table:
         f"Food eaten in 100 steps; in % of the oracle's; in the first and the last quarter of the seasons after the"
         f" first; microseconds a step and agent. Cold: without a warm start, but with one plan more. The oracle knows"
         f" where all food lies, and plans {FORESIGHT} times as far; where food will grow it does not know."
-        f" {runs.over_seeds(own)} *: p < 0.05 against random plans (tested: priors that learned, with a warm start),"
+        f" {runs.over_seeds(rows)} *: p < 0.05 against random plans (tested: priors that learned, with a warm start),"
         " corrected for all tests in this world."
     )
-    return table(own, columns, caption, own["world"].iloc[0], "lllrrrrr")
+    return table(rows, columns, caption, rows["world"].iloc[0], "lllrrrrr")
 
 
 @drawn
@@ -137,13 +137,13 @@ def live_figure(frame: pd.DataFrame, world: str, period: int) -> Figure:
     down = -(-len(shown) // across)
     figure, axes = panels(down, across, (WIDTH, 2.8 * down), sharey=True)
     for panel, (prior, context) in zip(axes, shown, strict=False):
-        own = frame[(frame["learns"] == "never") | (frame["prior"] == prior) & (frame["context"] == context)]
-        for (name, learns), lines in own.groupby(["prior", "learns"], sort=False):
+        panel_rows = frame[(frame["learns"] == "never") | (frame["prior"] == prior) & (frame["context"] == context)]
+        for (name, learns), lines in panel_rows.groupby(["prior", "learns"], sort=False):
             label = {RANDOM.prior: "random", ORACLE.prior: "oracle"}.get(name, f"learned {learns}")
             parts = 100 * pd.DataFrame(lines["rewards"].tolist())
-            found = mean_intervals(parts.melt(var_name="part"), "part", "value")
-            found["part"] = (found["part"].astype(float) + 0.5) * period / PARTS
-            points = found[["part", "mean", "low", "high"]].to_numpy()
+            intervals = mean_intervals(parts.melt(var_name="part"), "part", "value")
+            intervals["part"] = (intervals["part"].astype(float) + 0.5) * period / PARTS
+            points = intervals[["part", "mean", "low", "high"]].to_numpy()
             band(panel, points, COLORS.get(name, COLORS[learns]), label, "-")
         panel.set_title(f"{prior}, context: {context}")
         panel.set_xticks(np.arange(0, len(parts.columns) // PARTS + 1) * period)

@@ -100,7 +100,7 @@ def run_live(run: Run, settings: LiveSettings) -> dict[str, Any]:
     # There is one season more than those of the run: priors that learn before the run learn in it.
     food = patches(table, settings.seasons + 1, task.radius, generator)
     world = ForagingWorld(table, food, settings.period, settings.items)
-    state, own = world.reset(settings.agents, generator), draw_seed(generator)
+    state, agent_seed = world.reset(settings.agents, generator), draw_seed(generator)
     steps = settings.period * settings.seasons
 
     def agent(condition: Condition, prior: Prior, state: torch.Tensor, drawn: torch.Generator, learns: bool) -> Agent:
@@ -128,8 +128,8 @@ def run_live(run: Run, settings: LiveSettings) -> dict[str, Any]:
 
     entries = []
     for condition in conditions(settings.kinds):
-        drawn = torch.Generator().manual_seed(own)
-        prior = untrained(condition, table, own)
+        drawn = torch.Generator().manual_seed(agent_seed)
+        prior = untrained(condition, table, agent_seed)
         if condition.learns == "before":
             before = world.reset(settings.agents, drawn)
             before[:, 1] = steps

@@ -77,7 +77,12 @@ def mice(
     with Progress("mice", parts, parts) as progress:
         reached, priors, learned = simulate(settings, world, plans, progress.advance)
     rows, paired = reached_table(reached), paired_table(reached)
-    tables = _learned(learned), _reached(rows, settings), _normalised(rows, settings), _differences(paired)
+    tables = (
+        _learned_table(learned),
+        _reached_table(rows, settings),
+        _score_table(rows, settings),
+        _difference_table(paired),
+    )
     document = Document(
         "Mice in a labyrinth",
         _finding(rows, settings),
@@ -105,7 +110,7 @@ def mice(
     console.print(f"written to {folder}")
 
 
-def _learned(learned: pd.DataFrame) -> Table:
+def _learned_table(learned: pd.DataFrame) -> Table:
     columns: dict[str, Column] = {"learned\nfrom": "source", "plans": "plans:,", "moves": "moves:,"}
     for heading, context in (("no context", "moves"), ("node", "node")):
         columns |= {f"order,\n{heading}": f"markov_order_{context}", f"bits,\n{heading}": f"bits_{context}:.3f"}
@@ -114,14 +119,14 @@ def _learned(learned: pd.DataFrame) -> Table:
     return table(learned, columns, caption, "What the priors learned from")
 
 
-def _reached(rows: pd.DataFrame, settings: MiceSettings) -> Table:
+def _reached_table(rows: pd.DataFrame, settings: MiceSettings) -> Table:
     length = max(settings.lengths)
-    some = rows[rows.length == length]
+    longest = rows[rows.length == length]
     numbers = pd.DataFrame({"num_plans": settings.num_plans}, dtype="Int64")
-    best = some[some.prior == "oracle"].drop(columns="num_plans").merge(numbers, how="cross")
+    best = longest[longest.prior == "oracle"].drop(columns="num_plans").merge(numbers, how="cross")
     steps = numbers.assign(learned_from="model steps", prior="", context="")
-    some = pd.concat([some[some.prior != "oracle"], best])
-    cells = [plus_minus(row, "reached", 100) for _, row in some.iterrows()]
+    longest = pd.concat([longest[longest.prior != "oracle"], best])
+    cells = [plus_minus(row, "reached", 100) for _, row in longest.iterrows()]
     cells += [f"{length * number:,}" for number in settings.num_plans]
     starts = "all 126 nodes" if settings.starts == NODES else f"{settings.starts} nodes, drawn anew in each"
     caption = (
@@ -129,34 +134,34 @@ def _reached(rows: pd.DataFrame, settings: MiceSettings) -> Table:
         " what they learn from is the same. context: what a prior predicts from beside its own moves."
     )
     title = f"Water reached, % of the nodes: plans of {length} moves, by candidates"
-    return _by_prior(pd.concat([some, steps]), "num_plans", cells, title, caption)
+    return _table_by_prior(pd.concat([longest, steps]), "num_plans", cells, title, caption)
 
 
-def _normalised(rows: pd.DataFrame, settings: MiceSettings) -> Table:
+def _score_table(rows: pd.DataFrame, settings: MiceSettings) -> Table:
     number = sorted(settings.num_plans)[len(settings.num_plans) // 2]
-    some = rows[rows.num_plans == number]
+    chosen = rows[rows.num_plans == number]
     best = rows[rows.prior == "oracle"].assign(learned_from="oracle, % of the nodes", prior="")
-    shares = [*some.oracle_share, *best.reached]
+    shares = [*chosen.oracle_share, *best.reached]
     cells = ["" if pd.isna(share) else f"{100 * share:.1f}" for share in shares]
     title = f"Normalised score (% of what the oracle reaches): {number:,} candidates, by moves in a plan"
-    return _by_prior(pd.concat([some, best]), "length", cells, title)
+    return _table_by_prior(pd.concat([chosen, best]), "length", cells, title)
 
 
-def _differences(paired: pd.DataFrame) -> Table:
+def _difference_table(paired: pd.DataFrame) -> Table:
     length, numbers = paired.length.max(), sorted(paired.num_plans.unique())[:3]
-    some = paired[(paired.length == length) & paired.num_plans.isin(numbers)]
-    cells = [plus_minus(row, "difference", 100, sign="+") for _, row in some.iterrows()]
+    chosen = paired[(paired.length == length) & paired.num_plans.isin(numbers)]
+    cells = [plus_minus(row, "difference", 100, sign="+") for _, row in chosen.iterrows()]
     caption = "±: 95 % interval, paired over repeats; more in paired.csv"
-    return _by_prior(
-        some, "num_plans", cells, f"Differences in points: plans of {length} moves, by candidates", caption
+    return _table_by_prior(
+        chosen, "num_plans", cells, f"Differences in points: plans of {length} moves, by candidates", caption
     )
 
 
 def _finding(rows: pd.DataFrame, settings: MiceSettings) -> str:
     """How many candidates of the mice's priors are worth as much as the most random ones."""
-    most, some = max(settings.num_plans), rows[rows.length == max(settings.lengths)]
-    random = some[(some.prior == "uniform") & (some.num_plans == most)].reached.iloc[0]
-    enough = some[(some.learned_from == "mice") & (some.reached >= random)].groupby("context").num_plans.min()
+    most, longest = max(settings.num_plans), rows[rows.length == max(settings.lengths)]
+    random = longest[(longest.prior == "uniform") & (longest.num_plans == most)].reached.iloc[0]
+    enough = longest[(longest.learned_from == "mice") & (longest.reached >= random)].groupby("context").num_plans.min()
     need = {name: f"{enough[name]:,}" if name in enough else f"more than {most:,}" for name in ("moves", "node")}
     return (
         f"What {most:,} random candidates reach, the mice's best prior reaches with {need['moves']} without context and"
@@ -164,7 +169,7 @@ def _finding(rows: pd.DataFrame, settings: MiceSettings) -> str:
     )
 
 
-def _by_prior(rows: pd.DataFrame, by: str, cells: Sequence[str], title: str, caption: str = "") -> Table:
+def _table_by_prior(rows: pd.DataFrame, by: str, cells: Sequence[str], title: str, caption: str = "") -> Table:
     """A row a prior (or a pair of them) and a column for each value of `by`."""
     context, prior = rows.context.str.replace("moves", "none"), rows.prior.str.replace("transformer", "transf.")
     names = {"learned from": "learned_from", "prior": "prior", "context": "context"}

@@ -99,11 +99,11 @@ def reached_table(reached: pd.DataFrame) -> pd.DataFrame:
 def paired_table(reached: pd.DataFrame) -> pd.DataFrame:
     """Paired differences over repeats, a row a pair of priors, length and number of candidates."""
     groups = reached.set_index(["length", "num_plans", "seed"]).groupby(list(PriorName._fields))["reached"]
-    own, parts = dict(list(groups)), []
+    by_prior, parts = dict(list(groups)), []
     for what, first, second in _pairs():
         ends = zip(PriorName._fields, first, second, strict=True)
         names: dict[str, str] = {field: " - ".join(dict.fromkeys(pair)) for field, *pair in ends}
-        both = pd.DataFrame({"first": own[first], "second": own[second]}).reset_index()
+        both = pd.DataFrame({"first": by_prior[first], "second": by_prior[second]}).reset_index()
         parts.append(both.assign(**names, what=what, world="labyrinth"))
     by = ["world", *PriorName._fields, "what", "length", "num_plans"]
     return paired_differences(pd.concat(parts), by).drop(columns="world")
@@ -144,7 +144,7 @@ def simulate(
     dry = dry_nodes(world)
     sources = collected(settings, world, mice_plans, dry, generator)
     finished("collecting plans")
-    priors, learned = _count_based(sources, generator)
+    priors, learned = _fit_counts(sources, generator)
     finished("counting")
     rows: list[dict[str, Any]] = []
     for repeat in range(1, settings.seeds + 1):
@@ -161,8 +161,8 @@ def simulate(
             shares = shares_reached(planner, world, start, settings.lengths, settings.num_plans, drawn)
             rows += [
                 name._asdict() | {"seed": repeat, "length": length, "num_plans": number, "reached": share}
-                for length, some in zip(settings.lengths, shares.tolist(), strict=True)
-                for number, share in zip(settings.num_plans, some, strict=True)
+                for length, length_shares in zip(settings.lengths, shares.tolist(), strict=True)
+                for number, share in zip(settings.num_plans, length_shares, strict=True)
             ]
             finished(f"planning with {name}, repeat {repeat}")
         for length in settings.lengths:
@@ -191,7 +191,7 @@ def collected(
     return {"mice": cut_plans(mice_plans, max(settings.lengths)), "planner": searched, "reached": shot}
 
 
-def _count_based(sources: dict[str, Plans], generator: torch.Generator) -> tuple[dict[PriorName, Prior], pd.DataFrame]:
+def _fit_counts(sources: dict[str, Plans], generator: torch.Generator) -> tuple[dict[PriorName, Prior], pd.DataFrame]:
     """The uniform prior, and for each source the Markov priors of the orders that predict held-out plans best."""
     priors: dict[PriorName, Prior] = {UNIFORM: UniformPrior(4)}
     learned = []

@@ -134,10 +134,10 @@ def _panel(axes: Axes, rows: pd.DataFrame) -> None:
     best = rows[rows.prior == "oracle"].reached.iloc[0]
     axes.axhline(100 * best, color=COLORS["oracle"], linestyle=":", linewidth=1.4)
     tried = rows[rows.prior != "oracle"].astype({"num_plans": int}).sort_values("num_plans", kind="stable")
-    for _, some in tried.groupby(["prior", "context"], sort=False):
-        color, style = COLORS[some.prior.iloc[0]], STYLES[some.context.iloc[0]]
-        axes.plot(some.num_plans, 100 * some.reached, color=color, linestyle=style, linewidth=1.8)
-        axes.fill_between(some.num_plans, 100 * some.low, 100 * some.high, color=color, alpha=0.18, linewidth=0)
+    for _, curve in tried.groupby(["prior", "context"], sort=False):
+        color, style = COLORS[curve.prior.iloc[0]], STYLES[curve.context.iloc[0]]
+        axes.plot(curve.num_plans, 100 * curve.reached, color=color, linestyle=style, linewidth=1.8)
+        axes.fill_between(curve.num_plans, 100 * curve.low, 100 * curve.high, color=color, alpha=0.18, linewidth=0)
     axes.set_xscale("log", base=2)
     numbers = tried.num_plans.unique()
     axes.set_xticks(numbers, [f"{number:,}" for number in numbers])

@@ -70,8 +70,8 @@ def modes(
         load=load_arrays,
         suffix=".npz",
     )
-    found = run.do(jobs, processes=processes, dask=dask, title="fits")
-    frame = likelihoods(dict(zip(jobs, found, strict=True)), plans, settings.seed)
+    fits = run.do(jobs, processes=processes, dask=dask, title="fits")
+    frame = likelihoods(dict(zip(jobs, fits, strict=True)), plans, settings.seed)
     frames, tables, boxes = {"rows": frame}, [_likelihood_table(frame)], list[FigureBox]()
     lead, chosen = "No number of modes has modes that all come back in each fold.", described(frame)
     if chosen is not None:

@@ -77,10 +77,10 @@ def likelihoods(results: dict[Job, dict[str, np.ndarray[Any, Any]]], plans: Plan
         nats, least = torch.zeros(plans.actions.shape, dtype=torch.double), torch.ones(modes)
         whole = torch.from_numpy(results[Job(modes, order, FOLDS)]["modes"]).double()
         for fold, (_, held_out) in enumerate(parts):
-            found = results[Job(modes, order, fold)]
-            nats[held_out] = torch.from_numpy(found["nats"]).double()[held_out]
-            own = agreements(whole, torch.from_numpy(found["modes"]).double(), plans.mask())
-            least = torch.minimum(least, own)
+            inferred = results[Job(modes, order, fold)]
+            nats[held_out] = torch.from_numpy(inferred["nats"]).double()[held_out]
+            agreement = agreements(whole, torch.from_numpy(inferred["modes"]).double(), plans.mask())
+            least = torch.minimum(least, agreement)
         mean, low, high, _ = score_bits("", "", nats, plans, mask).bits_per_action()
         row = {"order": order, "modes": modes, "nats": mean, "low": low, "high": high}
         rows.append(row | {"stable": int((least >= STABLE).sum()), "correlation": [round(float(c), 3) for c in least]})
@@ -89,23 +89,23 @@ def likelihoods(results: dict[Job, dict[str, np.ndarray[Any, Any]]], plans: Plan
 
 def described(frame: pd.DataFrame) -> tuple[int, int] | None:
     """The number of modes and the order that are described: of those whose modes all come back, the likeliest."""
-    some = frame[(frame["modes"] > 1) & (frame["stable"] == frame["modes"])]
-    if some.empty:
+    stable = frame[(frame["modes"] > 1) & (frame["stable"] == frame["modes"])]
+    if stable.empty:
         return None
-    best = some.sort_values("nats").iloc[0]
+    best = stable.sort_values("nats").iloc[0]
     return int(best["modes"]), int(best["order"])
 
 
 class Events(NamedTuple):
     """What happens at each move, `[N, L]` bool each: the water, or home, is reached within `WITHIN`; the mouse turns.
 
-    Of the last moves of a sequence it is not known what is reached: `known` leaves these out.
+    Of the last moves of a sequence it is not known what is reached: `complete` leaves these out.
     """
 
     water: Tensor
     home: Tensor
     turns: Tensor
-    known: Tensor
+    complete: Tensor
 
 
 def events(plans: Plans) -> Events:
@@ -115,12 +115,12 @@ def events(plans: Plans) -> Events:
     out = plans.actions >= 2
     turns = torch.zeros_like(out)
     turns[:, 1:] = out[:, 1:] != out[:, :-1]
-    known = torch.arange(plans.max_length) <= plans.max_length - WITHIN
+    complete = torch.arange(plans.max_length) <= plans.max_length - WITHIN
     # At node 0 alone a move leads back to its node: home and back.
     reached = (arrivals(plans), after == plans.context)
     padded = (torch.cat([one, one.new_zeros(len(one), WITHIN - 1)], 1) for one in reached)
     water, home = (arrives_within(one, WITHIN) for one in padded)
-    return Events(water, home, turns, known.expand(out.shape))
+    return Events(water, home, turns, complete.expand(out.shape))
 
 
 def mode_rows(prior: SwitchingPrior, plans: Plans) -> pd.DataFrame:
@@ -128,12 +128,12 @@ def mode_rows(prior: SwitchingPrior, plans: Plans) -> pd.DataFrame:
 
     Shares of the moves: in the mode; and in it, those that turn, and from which water or home is reached.
     """
-    path, found, rows = mode_plans(prior, plans).actions, events(plans), []
+    path, flags, rows = mode_plans(prior, plans).actions, events(plans), []
     every = plans.mask()
     for k in range(prior.num_modes):
-        own = path == k
-        measures = {"moves": (own, every), "turns": (found.turns, own & (torch.arange(plans.max_length) > 0))}
-        measures |= {name: (getattr(found, name), own & found.known) for name in ("water", "home")}
+        in_mode = path == k
+        measures = {"moves": (in_mode, every), "turns": (flags.turns, in_mode & (torch.arange(plans.max_length) > 0))}
+        measures |= {name: (getattr(flags, name), in_mode & flags.complete) for name in ("water", "home")}
         for name, (values, mask) in measures.items():
             mean, low, high, _ = score_bits("", "", values.double(), plans, mask).bits_per_action()
             rows.append({"mode": k + 1, "what": name, "mean": mean, "low": low, "high": high})
@@ -147,7 +147,7 @@ def node_shares(prior: SwitchingPrior, plans: Plans) -> dict[str, Tensor]:
     """
     context = plans.context
     assert context is not None
-    path, found, states = mode_plans(prior, plans).actions, events(plans), labyrinth().num_states
+    path, flags, states = mode_plans(prior, plans).actions, events(plans), labyrinth().num_states
     modes = torch.arange(prior.num_modes)[:, None, None]
 
     def count(mask: Tensor) -> Tensor:
@@ -157,10 +157,10 @@ def node_shares(prior: SwitchingPrior, plans: Plans) -> dict[str, Tensor]:
         total = count(among)
         return (count(of) / total).masked_fill(total < FEW, torch.nan)
 
-    own = (path == modes) & plans.mask()
-    shown = {"moves": share(own, plans.mask().expand_as(own)), "turns": share(own & found.turns, own)}
-    known = own & found.known
-    return shown | {name: share(known & getattr(found, name), known) for name in ("water", "home")}
+    in_mode = (path == modes) & plans.mask()
+    shown = {"moves": share(in_mode, plans.mask().expand_as(in_mode)), "turns": share(in_mode & flags.turns, in_mode)}
+    complete = in_mode & flags.complete
+    return shown | {name: share(complete & getattr(flags, name), complete) for name in ("water", "home")}
 
 
 def since_water(prior: SwitchingPrior, plans: Plans) -> pd.DataFrame:
@@ -171,8 +171,8 @@ def since_water(prior: SwitchingPrior, plans: Plans) -> pd.DataFrame:
     moves, path, rows = step - last, mode_plans(prior, plans).actions, []
     edges = torch.tensor([*BINS, plans.max_length])
     for low_edge, high_edge in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        here = (moves >= low_edge) & (moves < high_edge) & plans.mask()
+        mask = (moves >= low_edge) & (moves < high_edge) & plans.mask()
         for k in range(prior.num_modes):
-            mean, low, high, _ = score_bits("", "", (path == k).double(), plans, here).bits_per_action()
+            mean, low, high, _ = score_bits("", "", (path == k).double(), plans, mask).bits_per_action()
             rows.append({"mode": k + 1, "from": low_edge, "share": mean, "low": low, "high": high})
     return pd.DataFrame(rows)

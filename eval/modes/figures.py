@@ -44,8 +44,8 @@ def maze_figure(shares: Mapping[str, Tensor]) -> Figure:
 def since_figure(since: pd.DataFrame) -> Figure:
     """The share of the moves in each mode against moves since the water; see `since_water`."""
     figure, (axes,) = panels(1, 1, (WIDTH, 2.8))
-    for number, (mode, own) in enumerate(since.groupby("mode", sort=False)):
-        points = own[["from", "share", "low", "high"]].assign(**{"from": own["from"] + 1})
+    for number, (mode, curve) in enumerate(since.groupby("mode", sort=False)):
+        points = curve[["from", "share", "low", "high"]].assign(**{"from": curve["from"] + 1})
         band(axes, points.to_numpy(float), STRIPS[number % len(STRIPS)], f"mode {mode}", "-")
     edges = since["from"].unique()
     axes.set_xscale("log")

@@ -61,8 +61,8 @@ def options(
     runs.check_distinct(worlds=worlds, lengths=lengths, num_plans=num_plans, modes=modes)
     if LABYRINTH in worlds:
         check_fits(starts, lengths)
-    numbers, own, kinds = (tuple(sorted(given)) for given in (num_plans, lengths, modes))
-    settings = OptionSettings(numbers, own, kinds, starts, training_starts, seed)
+    numbers, plan_lengths, kinds = (tuple(sorted(values)) for values in (num_plans, lengths, modes))
+    settings = OptionSettings(numbers, plan_lengths, kinds, starts, training_starts, seed)
     how = worlds, seeds, out, processes, dask
     document = runs.run_experiment("options", options_run, options_document, settings, *how)
     write_figures(Path(out), document.figures)

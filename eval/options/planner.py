@@ -63,9 +63,12 @@ class OptionPlanner(SamplingPlanner):
         def joined(parts: list[Tensor]) -> Tensor:
             return torch.cat(parts, 1)[:, order]
 
-        plans, rollouts = joined([plans for plans, _ in drawn]), [found for _, found in drawn if found is not None]
+        plans = joined([plans for plans, _ in drawn])
+        rollouts = [rollout for _, rollout in drawn if rollout is not None]
         if not rollouts:
             return plans, None
-        states = [found.states for found in rollouts if found.states is not None]
-        ends, rewards = (joined([getattr(found, name) for found in rollouts]) for name in ("final_state", "rewards"))
+        states = [rollout.states for rollout in rollouts if rollout.states is not None]
+        ends, rewards = (
+            joined([getattr(rollout, name) for rollout in rollouts]) for name in ("final_state", "rewards")
+        )
         return plans, Rollout(ends, rewards, joined(states) if states else None)

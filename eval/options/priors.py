@@ -70,33 +70,33 @@ def entrants(
     def chain(order: int, plans: Plans, **how: Any) -> MarkovPrior:
         return MarkovPrior(actions, order, num_contexts=num_contexts, **how).fit(plans)
 
-    some, others = training.split(VALIDATION, seed)
-    best = min(ORDERS, key=lambda order: bits(chain(order, some), others))
-    found = [entrant("flat", chain(best, training))]
+    train_plans, others = training.split(VALIDATION, seed)
+    best = min(ORDERS, key=lambda order: bits(chain(order, train_plans), others))
+    contestants = [entrant("flat", chain(best, training))]
     weaker = [
         entrant("", chain(order, training, backoff="dirichlet", smoothing=s)) for order in ORDERS for s in SMOOTHINGS
     ]
     for number in modes:
         one = entrant(f"switching-{number}", switching(number))
-        near = min([*weaker, found[0]], key=lambda other: abs(other.bits - one.bits))
-        found += [one, near._replace(label=f"flat-{number}")]
-        found.append(one._replace(label=f"options-{number}", planner=OptionPlanner))
-        found.append(one._replace(label=f"kept-{number}", planner=_kept))
+        near = min([*weaker, contestants[0]], key=lambda other: abs(other.bits - one.bits))
+        contestants += [one, near._replace(label=f"flat-{number}")]
+        contestants.append(one._replace(label=f"options-{number}", planner=OptionPlanner))
+        contestants.append(one._replace(label=f"kept-{number}", planner=_mode_keeper))
         if num_contexts is not None:
-            found.append(entrant(f"constant-{number}", switching(number, switching="constant")))
+            contestants.append(entrant(f"constant-{number}", switching(number, switching="constant")))
     if num_contexts is None:
         macro = entrant("macro", MacroPrior(actions).fit(training))
-        found = [entrant("uniform", UniformPrior(actions)), *found, macro]
-    return found
+        contestants = [entrant("uniform", UniformPrior(actions)), *contestants, macro]
+    return contestants
 
 
-def _kept(*arguments: Any, **how: Any) -> OptionPlanner:
+def _mode_keeper(*arguments: Any, **how: Any) -> OptionPlanner:
     return OptionPlanner(*arguments, terminations=False, **how)
 
 
 def pairs(modes: Sequence[int]) -> list[tuple[str, str]]:
     """The labels of what is compared: the first minus the second."""
-    own = [("switching", "flat"), ("options", "switching"), ("kept", "options"), ("switching", "constant")]
+    of_equal_number = [("switching", "flat"), ("options", "switching"), ("kept", "options"), ("switching", "constant")]
     against = [("switching", "flat"), ("switching", "macro"), ("kept", "flat"), ("kept", "macro")]
-    found = [(f"{first}-{number}", f"{second}-{number}") for first, second in own for number in modes]
-    return found + [(f"{first}-{number}", second) for first, second in against for number in modes]
+    labels = [(f"{first}-{number}", f"{second}-{number}") for first, second in of_equal_number for number in modes]
+    return labels + [(f"{first}-{number}", second) for first, second in against for number in modes]

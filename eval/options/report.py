@@ -44,15 +44,15 @@ def options_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str
     gaps = runs.paired_differences(compared, names)
     tables, boxes, leads = [], [], []
     for world, one in {result["world"]: result for result in results}.items():
-        own, differences = rows[rows["world"] == world], gaps[gaps["world"] == world]
-        for length in sorted(own["length"].unique()):
-            tables.append(share_table(own[own["length"] == length], world, length))
+        world_rows, differences = rows[rows["world"] == world], gaps[gaps["world"] == world]
+        for length in sorted(world_rows["length"].unique()):
+            tables.append(share_table(world_rows[world_rows["length"] == length], world, length))
         if len(differences):
             tables += [gap_table(differences, world, number) for number in fewest_and_middling(settings["num_plans"])]
             leads.append(finding(differences, world))
         caption = f"{world}: {one['about']}. Bands: Student's 95 % intervals over seeds. {WHAT}"
         alt = f"What is reached in {world} against the number of candidates, a line a prior; the numbers are in tables."
-        boxes.append(FigureBox(reached_figure(own, settings["modes"]), caption, alt, world))
+        boxes.append(FigureBox(reached_figure(world_rows, settings["modes"]), caption, alt, world))
     sections = [Section("Reached against candidates", figures=boxes), Section("Tables", tables=tables)]
     lead = " ".join(leads) or "Differences need at least two seeds."
     frames = {"rows": rows, "paired": gaps}
@@ -85,22 +85,22 @@ def share_table(rows: pd.DataFrame, world: str, length: int) -> Table:
 
 def gap_table(gaps: pd.DataFrame, world: str, number: int) -> Table:
     """Paired differences with one number of candidates, a row a pair and a column a length."""
-    some = gaps[gaps["num_plans"] == number]
-    cells = [runs.plus_minus(row, "difference", 100, sign="+").replace(" ", "") for _, row in some.iterrows()]
+    chosen = gaps[gaps["num_plans"] == number]
+    cells = [runs.plus_minus(row, "difference", 100, sign="+").replace(" ", "") for _, row in chosen.iterrows()]
     names = {"context": "context", "first": "first_prior", "minus": "second_prior"}
     caption = "Points; ±: 95 % interval, paired by seed; other numbers of candidates are in paired.csv."
     return runs.table_by(
-        some, names, "length", cells, caption, f"{world}: differences with {number} candidates, by actions in a plan"
+        chosen, names, "length", cells, caption, f"{world}: differences with {number} candidates, by actions in a plan"
     )
 
 
 def finding(gaps: pd.DataFrame, world: str) -> str:
     """How often modes reach more than the chain of equal likelihood, in one sentence."""
-    own = gaps["first_prior"].str.startswith("switching-") & gaps["second_prior"].str.startswith("flat-")
+    compared = gaps["first_prior"].str.startswith("switching-") & gaps["second_prior"].str.startswith("flat-")
     sums = []
-    for context, some in gaps[own].groupby("context", sort=False):
-        above, below = (some["low"] > 0).sum(), (some["high"] < 0).sum()
-        sums.append(f"context {context}: {above} of {len(some)} above 0, {below} below")
+    for context, group in gaps[compared].groupby("context", sort=False):
+        above, below = (group["low"] > 0).sum(), (group["high"] < 0).sum()
+        sums.append(f"context {context}: {above} of {len(group)} above 0, {below} below")
     return f"{world}, switching minus flat of equal likelihood (95 % intervals): {'; '.join(sums)}."
 
 
@@ -118,11 +118,11 @@ def reached_figure(rows: pd.DataFrame, modes: Sequence[int]) -> Figure:
     figure, axes = panels(len(contexts), len(lengths), (WIDTH, 2.6 * len(contexts)), sharey=True, sharex=True)
     places = [(context, length) for context in contexts for length in lengths]
     for panel, (context, length) in zip(axes, places, strict=True):
-        here = rows[(rows["context"] == context) & (rows["length"] == length)]
+        panel_rows = rows[(rows["context"] == context) & (rows["length"] == length)]
         for name, (color, style) in LINES.items():
-            own = here[here["prior"] == name.format(number)].sort_values("num_plans")
-            if len(own):
-                points = own[["num_plans", "share", "low", "high"]].to_numpy(float)
+            curve = panel_rows[panel_rows["prior"] == name.format(number)].sort_values("num_plans")
+            if len(curve):
+                points = curve[["num_plans", "share", "low", "high"]].to_numpy(float)
                 points[:, 1:] *= 100
                 band(panel, points, color, name.format(number), style)
         numbers = sorted(rows["num_plans"].unique())

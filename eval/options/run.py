@@ -60,28 +60,28 @@ def options_run(run: Run, settings: OptionSettings) -> dict[str, Any]:
     """
     generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + run.seed)
     if run.world == LABYRINTH:
-        about, entries = "the mice's labyrinth: to pass the water", _in_labyrinth(settings, generator)
+        about, entries = "the mice's labyrinth: to pass the water", _labyrinth_entries(settings, generator)
     else:
-        about, entries = TASKS[run.world].about, _in_world(run, settings, generator)
+        about, entries = TASKS[run.world].about, _world_entries(run, settings, generator)
     return run._asdict() | {"about": about, "entries": list(entries)}
 
 
-def _in_labyrinth(settings: OptionSettings, generator: torch.Generator) -> Iterator[dict[str, Any]]:
+def _labyrinth_entries(settings: OptionSettings, generator: torch.Generator) -> Iterator[dict[str, Any]]:
     world = labyrinth(absorbing=True)
     dry = dry_nodes(world)
     start = dry[torch.randperm(len(dry), generator=generator)[: settings.starts]]
     parts = cut_plans(read_plans(DATA), max(settings.lengths)).split(HELD_OUT, generator)
     for context, contexts in (("none", None), ("per-step", world.num_states)):
-        training, held_out = parts if contexts else (part.without_context() for part in parts)
+        training, held_out = parts if contexts else (plans.without_context() for plans in parts)
         for one in entrants(training, held_out, contexts, settings.modes, MICE_ORDERS[context], generator):
             most = max(settings.lengths), max(settings.num_plans)
             planner = reaching_planner(one.prior, *most, make=one.planner)
             shares = shares_reached(planner, world, start, settings.lengths, settings.num_plans, generator)
-            for length, some in zip(settings.lengths, shares.tolist(), strict=True):
-                yield from _entries(one, context, length, settings.num_plans, some)
+            for length, length_shares in zip(settings.lengths, shares.tolist(), strict=True):
+                yield from _entries(one, context, length, settings.num_plans, length_shares)
 
 
-def _in_world(run: Run, settings: OptionSettings, generator: torch.Generator) -> Iterator[dict[str, Any]]:
+def _world_entries(run: Run, settings: OptionSettings, generator: torch.Generator) -> Iterator[dict[str, Any]]:
     task = TASKS[run.world]
     worlds = task.worlds(settings.seed * 10_000 + run.seed)
     starts = starts_of(task, worlds.held_out, MORE_STARTS * settings.starts, task.length, generator)
@@ -94,10 +94,10 @@ def _in_world(run: Run, settings: OptionSettings, generator: torch.Generator) ->
     training, held_out = searched(worlds.training, number), searched(worlds.held_out, number // 4)
     index = index_of(training, task.feature_sets)
     for context, contexts in (("none", None), ("per-step", index.size)):
-        some, others, world = training.without_context(), held_out.without_context(), worlds.held_out
+        learned, others, world = training.without_context(), held_out.without_context(), worlds.held_out
         if contexts:
-            some, others, world = numbered(training, index), numbered(held_out, index), observed(world, index)
-        for one in entrants(some, others, contexts, settings.modes, ORDERS[context], generator):
+            learned, others, world = numbered(training, index), numbered(held_out, index), observed(world, index)
+        for one in entrants(learned, others, contexts, settings.modes, ORDERS[context], generator):
             planner = one.planner(one.prior, task.length, max(settings.num_plans), **task.scoring)
             shares = scores_reached(planner, replace(starts, world=world), settings.num_plans, generator)
             yield from _entries(one, context, task.length, settings.num_plans, shares)
@@ -125,14 +125,14 @@ def numbered(plans: Plans, index: ContextIndex) -> Plans:
 
 def observed(world: World, index: ContextIndex) -> World:
     """A world in which numbers of contexts are observed."""
-    made, observe = copy(world), world.observe
+    copied, observe = copy(world), world.observe
 
     def number(state: Tensor) -> Tensor:
         return index(observe(state))
 
-    made.observe = number  # type: ignore[method-assign]
-    made.observation = Categories(index.size)
-    return made
+    copied.observe = number  # type: ignore[method-assign]
+    copied.observation = Categories(index.size)
+    return copied
 
 
 def scores_reached(

@@ -89,11 +89,13 @@ def paper(
     for name in ("size", "value_functions"):
         if settings[name] < 2:
             raise ValueError(f"`{name}` must be an integer of at least 2, got {settings[name]}")
-    own = PaperSettings(**{name: value for name, value in settings.items() if name not in ("protocols", "out")})
+    paper_settings = PaperSettings(
+        **{name: value for name, value in settings.items() if name not in ("protocols", "out")}
+    )
     folder, console = Path(out), Console()
     results = {"settings": settings, "versions": versions(), "seed": seed}
-    for part in (_all_settings,) if protocols == "all" else (_first, _second):
-        results |= part(own, console, folder)
+    for simulate in (_all_settings,) if protocols == "all" else (_first, _second):
+        results |= simulate(paper_settings, console, folder)
         write_results(folder, results)  # an error in the second part does not lose the first
     console.print(f"written to {folder}")
 
@@ -134,8 +136,8 @@ def _first(settings: PaperSettings, console: Console, folder: Path) -> dict[str,
     }
     write_figures(folder, pictures)
     protocol = {name: getattr(settings, name) for name in PROTOCOLS}
-    found = {"protocol": protocol, "rows": records(rows), "paired": records(paired)}
-    return {"simulation_1": found | {"transition_matrix": learned.tolist()}}
+    results = {"protocol": protocol, "rows": records(rows), "paired": records(paired)}
+    return {"simulation_1": results | {"transition_matrix": learned.tolist()}}
 
 
 def _second(settings: PaperSettings, console: Console, folder: Path) -> dict[str, Any]:
@@ -173,20 +175,20 @@ def _second(settings: PaperSettings, console: Console, folder: Path) -> dict[str
     write_frames(folder, {"table_2": rows, "value_quality": quality})
     pictures = {"figure_1": figures.values_and_stuck(result, settings)}
     write_figures(folder, pictures | {"value_quality": figures.success_against_quality(quality)})
-    found = {"task": asdict(settings), "rows": records(rows), **ceilings, "paired": records(paired)}
-    return {"simulation_2": found | {"value_quality": records(quality)}}
+    results = {"task": asdict(settings), "rows": records(rows), **ceilings, "paired": records(paired)}
+    return {"simulation_2": results | {"value_quality": records(quality)}}
 
 
 def _all_settings(settings: PaperSettings, console: Console, folder: Path) -> dict[str, Any]:
     """Both tables under every protocol and scale, with the Markov priors alone."""
     with Progress("protocols and initial values", 16, 16) as progress:
         protocols = under_each(
-            PROTOCOLS, settings, lambda own: first_simulation.simulate(own, neural=False).summary(), progress.advance
+            PROTOCOLS, settings, lambda each: first_simulation.simulate(each, neural=False).summary(), progress.advance
         )
         scales = under_each(
-            SCALES, settings, lambda own: second_simulation.simulate(own, full=False)[0].summary(), progress.advance
+            SCALES, settings, lambda each: second_simulation.simulate(each, full=False)[0].summary(), progress.advance
         )
-    own = {"edges": "paper", **PAPER_BEST, **first_simulation.structure(PAPER_MATRIX)}
+    paper_row = {"edges": "paper", **PAPER_BEST, **first_simulation.structure(PAPER_MATRIX)}
     columns: dict[str, Column] = {
         "edges, ties,\nlearn from": lambda row: " ".join(row[list(PROTOCOLS)].dropna()),
         **{SHORT[name]: _percent(name) for name in PAPER_BEST},
@@ -197,7 +199,7 @@ def _all_settings(settings: PaperSettings, console: Console, folder: Path) -> di
         "off\nm.": "matrix_distance:.3f",
     }
     caption = "off: root mean square difference from the paper's table, points; off m.: from its matrix."
-    shown = table(pd.concat([protocols, pd.DataFrame([own])]), columns, caption)
+    shown = table(pd.concat([protocols, pd.DataFrame([paper_row])]), columns, caption)
     console.print(printed(f"Table 1 under every protocol, % of starts ({_amount(settings)})", shown))
     nearest = {
         what: records(protocols.nsmallest(1, f"{what}_distance")[list(PROTOCOLS)])[0] for what in ("table", "matrix")
@@ -215,8 +217,8 @@ def _all_settings(settings: PaperSettings, console: Console, folder: Path) -> di
         f"nearest to the paper's Table 2: [bold]{scale['edges']}, values up to {scale['initial_scale']:g}[/bold]"
     )
     write_frames(folder, {"protocols": protocols, "scales": scales})
-    found = {"protocols": records(protocols), "nearest": nearest}
-    return found | {"scales": records(scales), "nearest_scale": scale}
+    results = {"protocols": records(protocols), "nearest": nearest}
+    return results | {"scales": records(scales), "nearest_scale": scale}
 
 
 def _amount(settings: PaperSettings) -> str:

@@ -98,10 +98,10 @@ def _draw_plan(axes: Axes, world: GridWorld, start: Tensor, plan: Tensor, color:
     path, state = [world.coordinates(start)], start[None]
     for action in plan:
         state, _ = world.step(state, action[None])
-        here = world.coordinates(state)[0]
-        if int((here - path[-1]).abs().max()) > 1:
+        cell = world.coordinates(state)[0]
+        if int((cell - path[-1]).abs().max()) > 1:
             path.append(torch.full((2,), torch.nan))
-        path.append(here)
+        path.append(cell)
     places = torch.stack([place.double() for place in path]) + shift
     axes.plot(*places.T.flip(0).numpy(), color=color, linewidth=1.8, label=label, solid_capstyle="round")
     axes.plot(*places[-1:].T.flip(0).numpy(), "s", color=color, markersize=5)
@@ -138,11 +138,11 @@ def success_against_quality(rows: pd.DataFrame) -> Figure:
     order = list(rows["kind"].unique())
     figure, cells = panels(1, len(order), (2.6 * len(order) + 1, 3.4), sharey=True)
     for axes, kind in zip(cells, order, strict=True):
-        some = kinds.get_group(kind)
-        axes.plot(some.quality, 100 * some.ceiling, color="black", linestyle=":", label="ceiling")
-        for name in filter(some.__contains__, COLORS):
-            shares = 100 * some[[name, f"{name} low", f"{name} high"]]
-            band(axes, np.column_stack([some.quality, shares]), COLORS[name], name, "-")
+        group = kinds.get_group(kind)
+        axes.plot(group.quality, 100 * group.ceiling, color="black", linestyle=":", label="ceiling")
+        for name in filter(group.__contains__, COLORS):
+            shares = 100 * group[[name, f"{name} low", f"{name} high"]]
+            band(axes, np.column_stack([group.quality, shares]), COLORS[name], name, "-")
         axes.set_title({"sweeps": "value iteration cut short"}.get(kind, kind), fontsize=10)
         axes.set_xlabel("quality of the values")
         axes.spines[["top", "right"]].set_visible(False)

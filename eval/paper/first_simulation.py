@@ -55,9 +55,9 @@ class FirstResult(NamedTuple):
         best = best_of(torch.stack([*scores.values()]), torch.stack([scores[name] for name in PAPER_BEST]))
         steps = [decision.model_steps for decision in self.decisions.values()]
         return share_table("best", dict(zip(scores, best, strict=True)), PAPER_BEST).assign(
-            mean_reward=[float(own.double().mean()) for own in scores.values()],
-            oracle_share=[float(own.double().sum() / self.oracle.double().sum()) for own in scores.values()],
-            at_oracle=[float((own >= self.oracle).double().mean()) for own in scores.values()],
+            mean_reward=[float(score.double().mean()) for score in scores.values()],
+            oracle_share=[float(score.double().sum() / self.oracle.double().sum()) for score in scores.values()],
+            at_oracle=[float((score >= self.oracle).double().mean()) for score in scores.values()],
             model_steps=pd.array([*steps, None], dtype="Int64"),
         )
 
@@ -151,7 +151,7 @@ def _first_of_equals(world: GridWorld, states: Tensor, score: Tensor, depth: int
     """For each start the first, in the order of their numbers, of the plans with `score`: `[N, depth]`."""
     every = all_plans(4, depth)
     chosen = []
-    for some, best in zip(states.split(4096), score.split(4096), strict=True):
-        rewards = world.rollout(some, every.expand(len(some), *every.shape)).rewards[..., -1]
+    for batch, best in zip(states.split(4096), score.split(4096), strict=True):
+        rewards = world.rollout(batch, every.expand(len(batch), *every.shape)).rewards[..., -1]
         chosen.append(every[(rewards == best[:, None]).int().argmax(1)])
     return torch.cat(chosen)

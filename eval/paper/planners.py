@@ -115,7 +115,7 @@ def over_groups(hits: Tensor) -> Interval:
 
 def share_table(what: str, hits: Mapping[str, Tensor], paper: Mapping[str, float]) -> pd.DataFrame:
     """A row a planner: the share of True in its `hits [G, n]`, with an interval, and the paper's."""
-    shares = pd.DataFrame([over_groups(own) for own in hits.values()]).set_axis([what, "low", "high"], axis=1)
+    shares = pd.DataFrame([over_groups(hit) for hit in hits.values()]).set_axis([what, "low", "high"], axis=1)
     shares.insert(0, "planner", list(hits))
     return shares.assign(paper=shares.planner.map(paper))
 

@@ -71,9 +71,9 @@ class SecondResult(NamedTuple):
         share = {name: reached.double().mean(1) for name, reached in self.reached().items()}
         pairs = []
         for end in ("", ANY_PREFIX):
-            own = [("random", "deterministic"), ("markov-1", "random"), ("markov-2", "random")]
-            own = [(first + end, second + end) for first, second in own]
-            pairs += [*own, *((name + end, best_markov(share, end)) for name in ("gru", "transformer"))]
+            simple = [("random", "deterministic"), ("markov-1", "random"), ("markov-2", "random")]
+            simple = [(first + end, second + end) for first, second in simple]
+            pairs += [*simple, *((name + end, best_markov(share, end)) for name in ("gru", "transformer"))]
         return paired_table(share, pairs)
 
     def summary(self) -> dict[str, float]:

@@ -83,6 +83,6 @@ def quality(values: Tensor, exact: Tensor, goal: int) -> float:
     """
     other = torch.arange(len(exact)) != goal
     return sum(
-        0.0 if float(own[other].std()) < 1e-9 else float(spearmanr(own[other], exact[other]).statistic)
-        for own in values
+        0.0 if float(estimate[other].std()) < 1e-9 else float(spearmanr(estimate[other], exact[other]).statistic)
+        for estimate in values
     ) / len(values)

@@ -90,11 +90,11 @@ def q_learning(
     agent = torch.arange(num_agents, device=device)
     cell = _other_cells(goal, world.num_states, num_agents, generator)
     for step in range(steps):
-        here = values[agent, cell]
-        action = _choose(here, epsilon, generator)
+        q_values = values[agent, cell]
+        action = _choose(q_values, epsilon, generator)
         after, _ = world.step(cell, action, generator)
         # The value of the goal is 1 / discount, so that the target of reaching it is the reward, 1.
-        values[agent, cell, action] = here[agent, action].lerp(discount * values[agent, after].amax(1), step_size)
+        values[agent, cell, action] = q_values[agent, action].lerp(discount * values[agent, after].amax(1), step_size)
         cell = torch.where(after == goal, _other_cells(goal, world.num_states, num_agents, generator), after)
         if progress is not None:
             progress(step + 1, steps)
@@ -219,8 +219,8 @@ def network_approximation(
     finite = is_number(learning_rate) and 0 < learning_rate < math.inf
     _require(finite, "learning_rate", "a positive, finite number", learning_rate)
     generator = generator_on(generator, values.device)
-    target, mean, scale = _standardised(values.detach())
-    inputs = _standardised(coordinates.to(values.device).T)[0].T.expand(len(values), -1, -1)
+    target, mean, scale = _standardise(values.detach())
+    inputs = _standardise(coordinates.to(values.device).T)[0].T.expand(len(values), -1, -1)
     weights = []  # [K, 1 + inputs, outputs] a layer, the bias first
     for fan_in, fan_out in itertools.pairwise((inputs.shape[-1], hidden_size, hidden_size, 1)):
         uniform = torch.rand(len(values), 1 + fan_in, fan_out, generator=generator, device=values.device)
@@ -242,16 +242,16 @@ def _network(weights: list[Tensor], inputs: Tensor) -> Tensor:
     return inputs[..., 0]
 
 
-def _standardised(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _standardise(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Each row with mean 0 and standard deviation 1, float32; the means and deviations that were, `[N, 1]`."""
     rows = rows.double()
     mean, scale = rows.mean(1, keepdim=True), rows.std(1, correction=0, keepdim=True).clamp(min=1e-12)
     return ((rows - mean) / scale).float(), mean, scale
 
 
-def _require(holds: bool, name: str, wanted: str, given: object) -> None:
+def _require(holds: bool, name: str, wanted: str, value: object) -> None:
     if not holds:
-        raise ValueError(f"`{name}` must be {wanted}, got {given!r}")
+        raise ValueError(f"`{name}` must be {wanted}, got {value!r}")
 
 
 def _check_fit(values: Tensor, coordinates: Tensor) -> None:

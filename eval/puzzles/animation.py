@@ -26,15 +26,15 @@ def animation(world: PuzzleWorld, board: Tensor, moves: str) -> str:
     parts = [f'<rect width="{width * CELL}" height="{height * CELL}" fill="{FLOOR}"/>']
     if isinstance(world, SlidingTilesWorld):
         for tile in range(1, height * width):
-            parts.append(_moving(_tile(tile), [_first_cell(state == tile) for state in states], width))
+            parts.append(_animate(_tile(tile), [_first_cell(state == tile) for state in states], width))
     else:
         for cell, code in enumerate(board.flatten().tolist()):
             if code in (rules.WALL, rules.GOAL, rules.BOX_ON_GOAL, rules.PLAYER_ON_GOAL):
                 colour = WALL if code == rules.WALL else GOAL
                 parts.append(_rectangle(cell % width * CELL, cell // width * CELL, CELL, colour))
-        parts += [_moving(_rectangle(3, 3, CELL - 6, BOX), cells, width) for cells in _boxes(states)]
+        parts += [_animate(_rectangle(3, 3, CELL - 6, BOX), cells, width) for cells in _boxes(states)]
         player = f'<circle cx="{CELL / 2}" cy="{CELL / 2}" r="{CELL / 3}" fill="{PLAYER}"/>'
-        parts.append(_moving(player, [_first_cell(state >= rules.PLAYER) for state in states], width))
+        parts.append(_animate(player, [_first_cell(state >= rules.PLAYER) for state in states], width))
     size = f'width="{width * CELL}" height="{height * CELL}"'
     title = f"<title>A puzzle solved in {len(moves)} moves</title>"
     return f'<svg xmlns="http://www.w3.org/2000/svg" {size} role="img">{title}{"".join(parts)}</svg>\n'
@@ -67,7 +67,7 @@ def _tile(number: int) -> str:
     return f'{_rectangle(1, 1, CELL - 2, TILE)}<text {middle} font-family="sans-serif" font-size="14">{number}</text>'
 
 
-def _moving(shape: str, cells: list[int], width: int) -> str:
+def _animate(shape: str, cells: list[int], width: int) -> str:
     """A shape that is in these cells, one after the other."""
     places = [f"{cell % width * CELL} {cell // width * CELL}" for cell in cells]
     kept = [k for k in range(len(places)) if k == 0 or places[k] != places[k - 1]]

@@ -85,7 +85,7 @@ def puzzles(
         out: folder for tables (CSV), `results.json`, `solutions.jsonl`, `report.html` and finished jobs.
     """
     check_distinct(priors=priors)
-    files = [str(given or default) for given, default in zip((train, test), FILES[world], strict=True)]
+    files = [str(file or default) for file, default in zip((train, test), FILES[world], strict=True)]
     guided = world == "tiles" if guided is None else guided
     numbers = {"num_train": num_train, "budget": budget, "sweeps": sweeps, "seed": seed}
     settings = Settings(world=world, train=files[0], test=files[1], num_test=num_test, guided=guided, **numbers)
@@ -102,27 +102,27 @@ def puzzles(
     sweeps_of = first.do(list(range(seeds if needed else 0)), processes=processes, title="solve and learn")
     second = JobRun(partial(contest, settings, first.folder), Path(out) / "search", asked, name=lambda job: job.name)
     jobs = [Job(k, prior) for prior in priors for k in range(seeds if prior not in SEARCHES else 1)]
-    found = second.do(jobs, processes=processes, title="search")
-    document = report(found, [row for rows in sweeps_of for row in rows], both, settings)
+    searches = second.do(jobs, processes=processes, title="search")
+    document = report(searches, [row for rows in sweeps_of for row in rows], both, settings)
     publish(document, Path(out))
-    _write_solutions(found, both[1], Path(out))
+    _write_solutions(searches, both[1], Path(out))
 
 
 def report(
-    found: Sequence[dict[str, Any]], sweeps: Sequence[dict[str, Any]], both: Sequence[Problems], settings: Settings
+    searches: Sequence[dict[str, Any]], sweeps: Sequence[dict[str, Any]], both: Sequence[Problems], settings: Settings
 ) -> Document:
     """The tables: of all priors, of problems with walls of their own, of pairs of priors, and of the sweeps."""
-    each = pd.concat([_per_problem(one) for one in found], ignore_index=True)
-    seconds = pd.DataFrame([{key: one[key] for key in ("prior", "seed", "seconds")} for one in found])
+    each = pd.concat([_problem_rows(one) for one in searches], ignore_index=True)
+    seconds = pd.DataFrame([{key: one[key] for key in ("prior", "seed", "seconds")} for one in searches])
     rows = _rows(each, seconds)
     frames = {"puzzles": rows, "pairs": _pairs(each), "sweeps": pd.DataFrame(sweeps)}
     tables = [_table(rows, "Test problems", settings)]
     if settings.world == "sokoban":
-        known, walls = (_walls(problems) for problems in both)
-        among = set(known)
-        own = [number for number, layout in enumerate(walls) if layout not in among]
-        if 0 < len(own) < len(both[1].boards):
-            apart = _rows(each[each["problem"].isin(own)], seconds)
+        train_walls, walls = (_walls(problems) for problems in both)
+        among = set(train_walls)
+        new_walls = [number for number, layout in enumerate(walls) if layout not in among]
+        if 0 < len(new_walls) < len(both[1].boards):
+            apart = _rows(each[each["problem"].isin(new_walls)], seconds)
             frames["own_walls"] = apart = apart.drop(columns="seconds_per_problem")
             tables.append(_table(apart, "Test problems whose walls are those of no training problem", settings))
     if len(frames["pairs"]):
@@ -145,7 +145,7 @@ def _walls(problems: Problems) -> list[int]:
     return [] if groups is None else groups.tolist()
 
 
-def _per_problem(one: dict[str, Any]) -> pd.DataFrame:
+def _problem_rows(one: dict[str, Any]) -> pd.DataFrame:
     """A row a problem: of one prior and seed."""
     frame = pd.DataFrame({"expansions": one["expansions"], "moves": one["moves"]})
     frame["solved"], frame["length"] = frame["moves"].notna(), frame["moves"].str.len()
@@ -238,20 +238,20 @@ def _sweep_table(sweeps: pd.DataFrame) -> Table:
     return table(sweeps, columns, caption, "Solve and learn")
 
 
-def _write_solutions(found: Sequence[dict[str, Any]], test: Problems, out: Path) -> None:
+def _write_solutions(searches: Sequence[dict[str, Any]], test: Problems, out: Path) -> None:
     """`solutions.jsonl`, a line a problem, prior and seed; and an animated solution of the first prior."""
     lines = [
         json.dumps({"prior": one["prior"], "seed": one["seed"], "problem": k, "solved": moves is not None,
                     "expansions": expansions, "moves": moves})
-        for one in found
+        for one in searches
         for k, (moves, expansions) in enumerate(zip(one["moves"], one["expansions"], strict=True))
     ]  # fmt: skip
     with claim(out) as place:
         place.add(["solutions.jsonl", "solution.svg"])
     write_whole(out / "solutions.jsonl", ("\n".join(lines) + "\n").encode())
-    solved = [(len(moves), k) for k, moves in enumerate(found[0]["moves"]) if moves]
+    solved = [(len(moves), k) for k, moves in enumerate(searches[0]["moves"]) if moves]
     if solved:
         number = sorted(solved)[len(solved) // 2][1]
         write_whole(
-            out / "solution.svg", animation(test.world, test.boards[number], found[0]["moves"][number]).encode()
+            out / "solution.svg", animation(test.world, test.boards[number], searches[0]["moves"][number]).encode()
         )

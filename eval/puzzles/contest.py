@@ -105,14 +105,14 @@ def problems_of(settings: Settings) -> tuple[Problems, Problems]:
     """
     make: Callable[..., PuzzleWorld] = sokoban if settings.world == "sokoban" else sliding_tiles
     worlds = [make(file) for file in (settings.train, settings.test)]
-    expected, found = (list(world.shape) for world in worlds)
-    if expected != found and settings.world == "sokoban":
-        high, wide = map(max, zip(expected, found, strict=True))
+    expected, test_shape = (list(world.shape) for world in worlds)
+    if expected != test_shape and settings.world == "sokoban":
+        high, wide = map(max, zip(expected, test_shape, strict=True))
         boards = [world.boards for world in worlds if world.boards is not None]
-        padded = [pad(some, (0, wide - some.shape[2], 0, high - some.shape[1]), value=WALL) for some in boards]
-        worlds = [sokoban(some) for some in padded]
-    elif expected != found:
-        raise ValueError(f"{settings.test}: boards must be {expected}, as in {settings.train}, got {found}.")
+        padded = [pad(layout, (0, wide - layout.shape[2], 0, high - layout.shape[1]), value=WALL) for layout in boards]
+        worlds = [sokoban(layout) for layout in padded]
+    elif expected != test_shape:
+        raise ValueError(f"{settings.test}: boards must be {expected}, as in {settings.train}, got {test_shape}.")
     numbers = settings.num_train, settings.num_test
     train, test = (
         Problems(world, world.boards[:number])
@@ -131,11 +131,11 @@ def bootstrapped(settings: Settings, folder: Path, seed: int) -> list[dict[str, 
         how["teacher"] = AStarPlanner(train.world.lower_bound, weight, nodes)
     prior = LogLinearPrior(4, len(train.world.windows.windows))
     how |= {"folder": folder / f"seed-{seed}", "generator": torch.Generator().manual_seed(seed)}
-    sweeps = bootstrap(train.world, prior, _shuffled(train.boards, settings, seed), sweeps=settings.sweeps, **how)
+    sweeps = bootstrap(train.world, prior, _shuffle(train.boards, settings, seed), sweeps=settings.sweeps, **how)
     return [{"seed": seed} | sweep._asdict() for sweep in sweeps]
 
 
-def _shuffled(boards: torch.Tensor, settings: Settings, seed: int) -> torch.Tensor:
+def _shuffle(boards: torch.Tensor, settings: Settings, seed: int) -> torch.Tensor:
     """The training problems in the order of a seed."""
     generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + seed)
     return boards[torch.randperm(len(boards), generator=generator)]
@@ -165,22 +165,24 @@ def contest(settings: Settings, folder: Path, job: Job) -> dict[str, Any]:
     generator = torch.Generator().manual_seed(job.seed)
     _search(planner, test, problems[:1], generator)  # compiled loops are loaded
     begin = time.perf_counter()
-    found = _search(planner, test, problems, generator)
+    outcome = _search(planner, test, problems, generator)
     seconds = time.perf_counter() - begin
-    if not bool((test.solved(found.final_state) == found.solved).all()):
+    if not bool((test.solved(outcome.final_state) == outcome.solved).all()):
         raise RuntimeError(f"{job.name}: a plan does not do what the search says")
     bounded = isinstance(planner, LevinPlanner) and planner.heuristic is None
-    if bounded and bool((found.expansions.double().log() > found.log_bound + 1e-9).any()):
+    if bounded and bool((outcome.expansions.double().log() > outcome.log_bound + 1e-9).any()):
         raise RuntimeError(f"{job.name}: more expansions than the bound allows")
     moves = [
         "".join(LETTERS[action] for action in plan[:length]) if solved else None
-        for plan, length, solved in zip(found.plan.tolist(), found.lengths.tolist(), found.solved.tolist(), strict=True)
+        for plan, length, solved in zip(
+            outcome.plan.tolist(), outcome.lengths.tolist(), outcome.solved.tolist(), strict=True
+        )
     ]
     return job._asdict() | {
         "budget": budget,
         "seconds": seconds,
-        "expansions": found.expansions.tolist(),
-        "log_bound": [bound if np.isfinite(bound) else None for bound in found.log_bound.tolist()],
+        "expansions": outcome.expansions.tolist(),
+        "log_bound": [bound if np.isfinite(bound) else None for bound in outcome.log_bound.tolist()],
         "moves": moves,
     }
 

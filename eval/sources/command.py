@@ -48,13 +48,13 @@ def sources(
         out: folder for the report and for finished runs.
     """
     runs.check_distinct(worlds=worlds, plans=plans)
-    for name, least, given in (
+    for name, least, number in (
         ("plans", MIN_LEARNED, min(plans)),
         ("calls", 2, calls),
         ("num_plans", len(SOURCES), num_plans),
     ):
-        if given < least:
-            raise ValueError(f"`{name}` must be at least {least}, got {given}")
+        if number < least:
+            raise ValueError(f"`{name}` must be at least {least}, got {number}")
     settings = SourceSettings(tuple(sorted(plans)), calls, starts, num_plans, seed)
     document = runs.run_experiment(
         "sources", run_sources, sources_document, settings, worlds, seeds, out, processes, dask

@@ -23,7 +23,7 @@ def sources_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str
     if any(one["entries"] for one in results):
         frame = runs.frame_of(results)
         rows = source_rows(frame)
-        parts = [rows[rows["part"] == part] for part in PARTS]
+        parts = [rows[rows["part"] == calls] for calls in PARTS]
         frames, tables = {"rows": rows, "scores": frame}, [*map(source_table, parts)]
         words = [*map(finding, parts), *words]
     boxes = []
@@ -78,10 +78,10 @@ def gap_figure(rows: pd.DataFrame) -> Figure:
     figure = Figure(figsize=(6.4, 0.42 * len(worlds) + 0.9), layout="constrained")
     axes = figure.subplots()
     axes.axvline(0, color="0.6", linewidth=0.8)
-    for k, (number, some) in enumerate(rows.groupby("plans")):
-        height = [worlds.index(world) + 0.22 * (k - 1) for world in some["world"]]
-        gap = 100 * some["over_best"]
-        ends = [gap - 100 * some["over_best_low"], 100 * some["over_best_high"] - gap]
+    for k, (number, group) in enumerate(rows.groupby("plans")):
+        height = [worlds.index(world) + 0.22 * (k - 1) for world in group["world"]]
+        gap = 100 * group["over_best"]
+        ends = [gap - 100 * group["over_best_low"], 100 * group["over_best_high"] - gap]
         axes.errorbar(gap, height, xerr=ends, fmt="o", markersize=3.5, linewidth=1, label=f"{number} plans")
     axes.set(yticks=range(len(worlds)), yticklabels=worlds, xlabel="shared minus best source, points of the optimum")
     axes.set_xlim(-20, 20)

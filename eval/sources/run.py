@@ -76,7 +76,7 @@ def run_sources(run: Run, settings: SourceSettings) -> dict[str, Any]:
     def scores_with(prior: Steppable | Sequence[Steppable]) -> Tensor:
         planner = SamplingPlanner(prior, length, settings.num_plans, num_rollouts=8 if world.stochastic else None)
         drawn = torch.Generator().manual_seed(plan_seed)
-        plans = torch.cat([planner.plan(world, some, drawn).plan for some in state.split(settings.starts)])
+        plans = torch.cat([planner.plan(world, batch, drawn).plan for batch in state.split(settings.starts)])
         return trial.true_scores(world, state, plans[:, None], score_seed)[:, 0]
 
     random = trial.random_scores(world, state, length, trial.RANDOM_PLANS, generator, score_seed)
@@ -89,10 +89,10 @@ def run_sources(run: Run, settings: SourceSettings) -> dict[str, Any]:
         scores = {"uniform": uniform} | {name: scores_with(prior) for name, prior in priors.items()}
         scores["shared"] = scores_with(list(priors.values()))
         highest = torch.stack(list(scores.values())).amax(0) if best is None else best.double()
-        for part, first in zip(PARTS, (0, settings.starts * (settings.calls // 2)), strict=True):
+        for calls, first in zip(PARTS, (0, settings.starts * (settings.calls // 2)), strict=True):
             room = float((highest - random)[first:].sum())
             if room <= 0:
                 return run._asdict() | {"entries": [], "note": "no plan is better than random ones"}
             shares = {name: float((score - random)[first:].sum()) / room for name, score in scores.items()}
-            entries.append({"plans": asked, "learned": len(plans), "part": part, **shares})
+            entries.append({"plans": asked, "learned": len(plans), "part": calls, **shares})
     return run._asdict() | {"entries": entries, "note": ""}

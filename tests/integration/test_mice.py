@@ -12,7 +12,7 @@ from scipy import stats
 
 from eval.__main__ import main
 from eval.mice import experiment
-from eval.mice.experiment import NEURAL, MiceSettings, PriorName, _count_based, collected, simulate
+from eval.mice.experiment import NEURAL, MiceSettings, PriorName, _fit_counts, collected, simulate
 from eval.mice.figures import far_from_water, left_turns, passages
 from eval.worlds.labyrinth import DATA, reaching_planner, shares_reached
 from eval.worlds.labyrinth_drawing import ENTRANCE, coordinates
@@ -130,7 +130,7 @@ def test_what_is_learned_from():
 def test_orders_are_chosen_on_some_plans_and_then_all_are_counted():
     actions = markov_plans(markov_probs(4, 2, 0, 3.0), 300, 12, 1).actions
     plans = Plans(actions, 4, context=torch.randint(127, (300, 12), generator=seeded(2)))
-    priors, learned = _count_based({"mice": plans}, seeded(0))
+    priors, learned = _fit_counts({"mice": plans}, seeded(0))
     training, validation = (Plans(part.actions, 4) for part in plans.split(0.1, seeded(0)))
     costs = [-float(MarkovPrior(4, order).fit(training).log_prob(validation).sum()) for order in range(9)]
     best = costs.index(min(costs))

@@ -54,7 +54,7 @@ def test_events_of_a_walk_to_the_water_and_home():
     assert found.home[0].tolist() == [any(t <= a < t + WITHIN for a in homes) for t in times]
     # Out after in at the water, in after out at home, and out again after the second arrival.
     assert found.turns[0].nonzero()[:, 0].tolist() == [arrivals[0] + 1, homes[0] + 1, arrivals[1] + 1]
-    assert found.known[0].tolist() == [t <= len(nodes) - 1 - WITHIN for t in times]
+    assert found.complete[0].tolist() == [t <= len(nodes) - 1 - WITHIN for t in times]
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_shares_of_nodes_are_those_of_the_most_probable_path(plans, prior):
             assert float(shares["turns"][k, node]) == pytest.approx(
                 float(found.turns[own].double().mean()), nan_ok=True
             )
-            own &= found.known
+            own &= found.complete
             assert float(shares["water"][k, node]) == pytest.approx(
                 float(found.water[own].double().mean()), nan_ok=True
             )
