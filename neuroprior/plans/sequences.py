@@ -27,15 +27,15 @@ def as_index(index: Any, num: int) -> Tensor | slice:
         raise IndexError(
             f"`plans` must be indexed by a slice or a tensor; plans[{number} : {number + 1 or ''}] is one plan"
         )
-    given = torch.as_tensor(index)
-    given = given.long() if is_integer(given) or not given.numel() else given
-    mask = given.dtype == torch.bool
-    if given.dim() != 1 or not (mask or is_integer(given)) or (mask and len(given) != num):
-        raise IndexError(f"`plans` must be indexed by a slice, integers [M] or bool [{num}], got {describe(given)}")
-    wrong = given[:0] if mask else given[(given < -num) | (given >= num)]
+    chosen = torch.as_tensor(index)
+    chosen = chosen.long() if is_integer(chosen) or not chosen.numel() else chosen
+    mask = chosen.dtype == torch.bool
+    if chosen.dim() != 1 or not (mask or is_integer(chosen)) or (mask and len(chosen) != num):
+        raise IndexError(f"`plans` must be indexed by a slice, integers [M] or bool [{num}], got {describe(chosen)}")
+    wrong = chosen[:0] if mask else chosen[(chosen < -num) | (chosen >= num)]
     if len(wrong):
         raise IndexError(f"`plans` must be indexed by integers from 0 to {num - 1}, got {int(wrong[0])}")
-    return given
+    return chosen
 
 
 class Sequences(ABC):

@@ -221,8 +221,8 @@ def _delimiter(line: str) -> str:
 def _cells(rows: list[Row], columns: list[int]) -> list[str]:
     """The cells of some columns, row by row."""
     if columns == list(range(columns[0], columns[-1] + 1)):  # a slice is taken faster
-        part = slice(columns[0], columns[-1] + 1)
-        return [cell for row in rows for cell in row[part]]
+        span = slice(columns[0], columns[-1] + 1)
+        return [cell for row in rows for cell in row[span]]
     return [row[i] for row in rows for i in columns]
 
 
@@ -270,11 +270,11 @@ def _rows_of(plans: Plans) -> Iterator[list[Any]]:
         for names in (plans.action_names, plans.context_names, plans.group_names)
     )
     for start in range(0, len(plans), 2**14):
-        part = plans[start : start + 2**14]
-        none: list[list[Any]] = [[]] * len(part)
+        chunk = plans[start : start + 2**14]
+        none: list[list[Any]] = [[]] * len(chunk)
         contexts = none if context is None else named(context[start : start + 2**14].tolist(), context_names)
-        groups = none if part.group is None else named(part.group.tolist(), group_names)
-        actions, lengths = named(part.actions.tolist(), action_names), part.mask().sum(1).tolist()
-        for taken, length, *own in zip(actions, lengths, contexts, groups, strict=True):
-            more = [cell for entry in own for cell in (entry if isinstance(entry, list) else [entry])]
+        groups = none if chunk.group is None else named(chunk.group.tolist(), group_names)
+        actions, lengths = named(chunk.actions.tolist(), action_names), chunk.mask().sum(1).tolist()
+        for taken, length, *entries in zip(actions, lengths, contexts, groups, strict=True):
+            more = [cell for entry in entries for cell in (entry if isinstance(entry, list) else [entry])]
             yield [*taken[:length], *[""] * (width - length), *more]

@@ -74,14 +74,14 @@ def write_jsonl(plans: Plans, path: Path) -> None:
     with written_whole(path) as file:
         file.write(json.dumps(header, ensure_ascii=False) + "\n")
         for start in range(0, len(plans), 2**14):
-            some = plans[start : start + 2**14]
-            columns = {"actions": named(some.actions.tolist(), plans.action_names)}
-            if some.context is not None:
-                context = some.context if once is None else once[start : start + 2**14]
+            chunk = plans[start : start + 2**14]
+            columns = {"actions": named(chunk.actions.tolist(), plans.action_names)}
+            if chunk.context is not None:
+                context = chunk.context if once is None else once[start : start + 2**14]
                 columns["context"] = named(context.tolist(), plans.context_names)
-            if some.group is not None:
-                columns["group"] = named(some.group.tolist(), plans.group_names)
-            for length, *values in zip(some.mask().sum(1).tolist(), *columns.values(), strict=True):
+            if chunk.group is not None:
+                columns["group"] = named(chunk.group.tolist(), plans.group_names)
+            for length, *values in zip(chunk.mask().sum(1).tolist(), *columns.values(), strict=True):
                 row = dict(zip(columns, values, strict=True))
                 row["actions"] = row["actions"][:length]
                 if once is None and "context" in row:
@@ -113,11 +113,11 @@ def _objects(file: Any, path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
 
 def _once_each(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """A JSON object; raises ValueError where a key is given twice, of which one would be lost."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    entries = dict(pairs)
+    if len(entries) < len(pairs):
         keys = [key for key, _ in pairs]
         raise ValueError(f"the key {next(key for key in keys if keys.count(key) > 1)!r} is given twice")
-    return found
+    return entries
 
 
 def _refuse_constant(text: str) -> NoReturn:
@@ -130,15 +130,15 @@ class _Rows:
     def __init__(self, path: Path, header: dict[str, Any], num_actions: int | None, names: Names | None) -> None:
         self.path = path
         self.given_names = names
-        own = _header_names(header, "action_names")
+        header_names = _header_names(header, "action_names")
         self.num_actions = num_actions if num_actions is not None or names is not None else header.get("num_actions")
         # Actions are read by the names of the file, and numbered as the caller wants at the end: so is `end`.
-        self.action_names = own if own is not None else names
-        check_names(self.num_actions, own if names is None else None)
+        self.action_names = header_names if header_names is not None else names
+        check_names(self.num_actions, header_names if names is None else None)
         self.end = header.get("end")
         if self.end is not None and type(self.end) is not int:
             raise ValueError(f"`end` must be an action's number, got {_short(self.end)}")
-        self.actions = Column("action", self.action_names, None if own is not None else self.num_actions)
+        self.actions = Column("action", self.action_names, None if header_names is not None else self.num_actions)
         self.group = Column("group", _header_names(header, "group_names"))
         self.contexts = _Contexts(_header_names(header, "context_names"))
         self.action_kind: type | None = None

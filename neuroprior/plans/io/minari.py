@@ -40,11 +40,11 @@ def read_minari(dataset_id: str, *, observations: bool = True) -> Plans:
         space, observed = dataset.action_space, dataset.observation_space
         if not isinstance(space, spaces.Discrete):
             raise ValueError(
-                f"actions of the space {_shown(space)}; discrete actions are expected; of a Box see read_vector_plans"
+                f"actions of the space {_text(space)}; discrete actions are expected; of a Box see read_vector_plans"
             )
-        known = (spaces.Discrete, spaces.Box, spaces.MultiDiscrete, spaces.MultiBinary)
-        if observations and not isinstance(observed, known):
-            raise ValueError(f"observations of the space {_shown(observed)}; leave them out with observations=False")
+        readable = (spaces.Discrete, spaces.Box, spaces.MultiDiscrete, spaces.MultiBinary)
+        if observations and not isinstance(observed, readable):
+            raise ValueError(f"observations of the space {_text(observed)}; leave them out with observations=False")
         first = int(observed.start) if isinstance(observed, spaces.Discrete) else 0
         episodes = [
             {
@@ -56,7 +56,7 @@ def read_minari(dataset_id: str, *, observations: bool = True) -> Plans:
         plans = from_trajectories(episodes, int(space.n))
         groups = [about.get("group") for about in dataset.storage.get_episode_metadata(dataset.episode_indices)]
         ours = json.loads(dataset.storage.metadata.get(OURS, "{}"))
-        return _restored(plans, groups, ours, observations)
+        return _restore(plans, groups, ours, observations)
 
 
 def local_dataset(dataset_id: str) -> Any:
@@ -140,7 +140,7 @@ def _context_of_steps(plans: Plans) -> tuple[torch.Tensor, Any]:
     return context, spaces.Discrete(count)
 
 
-def _restored(plans: Plans, groups: list[Any], ours: dict[str, Any], observations: bool) -> Plans:
+def _restore(plans: Plans, groups: list[Any], ours: dict[str, Any], observations: bool) -> Plans:
     """Plans as they were written: with names, groups and `end`, and without a context where they had none."""
     context = plans.context if ours.get("context", True) else None
     grouped = bool(groups) and all(group is not None for group in groups)
@@ -188,5 +188,5 @@ def _module(name: str) -> Any:
         raise ImportError(f"Minari cannot be used ({error}); pip install 'neuroprior[gym]'") from error
 
 
-def _shown(space: Any) -> str:
+def _text(space: Any) -> str:
     return " ".join(str(space).split())[:100]

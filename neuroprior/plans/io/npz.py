@@ -42,13 +42,13 @@ def read_npz(path: Path, num_actions: int | None, action_names: Names | None, ki
     numbers: dict[str, Any] = {key: torch.from_numpy(native(arrays[key])) for key in numbered if key in arrays}
     names: dict[str, Any] = {key: names_of(path, key, arrays[key]) for key in texts if key in arrays}
     whole: dict[str, Any] = {key: _whole(path, key, arrays[key]) for key in counts if key in arrays}
-    known = num_actions or whole.get("num_actions")
-    if known is None and "action_names" in names:
-        known = len(names["action_names"])
+    count = num_actions or whole.get("num_actions")
+    if count is None and "action_names" in names:
+        count = len(names["action_names"])
     try:
-        if known is None:
-            known = count_up_to(_largest(numbers)) if action_names is None else len(action_names)
-        plans = kind(**whole | {"num_actions": known}, **numbers, **names)
+        if count is None:
+            count = count_up_to(_largest(numbers)) if action_names is None else len(action_names)
+        plans = kind(**whole | {"num_actions": count}, **numbers, **names)
         if plans.context is not None and plans.context.is_floating_point():
             check_single_precision("context", plans.context[plans.mask()])
         plans = renamed(plans, action_names, str(path))
@@ -77,11 +77,11 @@ def write_npz(plans: Plans, path: Path) -> None:
 
 def _fields(kind: type[Plans]) -> tuple[list[str], list[str], list[str]]:
     """The names of the fields that are tensors, integers and texts."""
-    found: dict[Any, list[str]] = {torch.Tensor: [], int: [], str: []}
+    names_by_type: dict[Any, list[str]] = {torch.Tensor: [], int: [], str: []}
     for field in fields(kind):
         holds = (field.type, *get_args(field.type))
-        found[next((one for one in (torch.Tensor, int) if one in holds), str)].append(field.name)
-    return found[torch.Tensor], found[int], found[str]
+        names_by_type[next((one for one in (torch.Tensor, int) if one in holds), str)].append(field.name)
+    return names_by_type[torch.Tensor], names_by_type[int], names_by_type[str]
 
 
 def _holds_texts(array: NDArray[Any] | None) -> bool:
@@ -96,11 +96,11 @@ def arrays_of(path: Path, keys: Sequence[str]) -> tuple[dict[str, NDArray[Any]],
     key = None
     try:
         with np.load(path, allow_pickle=False) as file:
-            found = {}
+            arrays = {}
             for key in [key for key in file.files if key in keys]:
                 _check_growth(next(one for one in file.zip.infolist() if one.filename in (key, f"{key}.npy")))
-                found[key] = np.asarray(file[key])
-            return found, [key for key in file.files if key not in keys]
+                arrays[key] = np.asarray(file[key])
+            return arrays, [key for key in file.files if key not in keys]
     except Exception as error:  # numpy, zipfile and zlib raise a dozen unrelated kinds over damaged bytes
         reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
         if "allow_pickle" in reason:

@@ -47,13 +47,13 @@ def from_trajectories(trajectories: Iterable[Any], num_actions: int, *, observat
     observed: list[NDArray[Any] | None] = []
     for number, trajectory in enumerate(trajectories):
         place = f"trajectory {number}"
-        taken, made = parts_of(trajectory, place)
+        taken, seen = parts_of(trajectory, place)
         actions.append(_actions(taken, num_actions, place))
         if observations is not None:
-            observed.append(None if made is None else observations_of(made, len(actions[-1]), place))
+            observed.append(None if seen is None else observations_of(seen, len(actions[-1]), place))
     if not actions:
         raise ValueError("`trajectories` must have at least one trajectory, got an empty list")
-    lengths = np.array([len(part) for part in actions])
+    lengths = np.array([len(steps) for steps in actions])
     context = joined(observed)
     return assembled("trajectories", lengths, np.concatenate(actions), num_actions, context=context, per_step=True)
 
@@ -79,25 +79,25 @@ def to_trajectories(plans: Plans, kind: Literal["dicts", "imitation"] = "dicts")
         raise ValueError(f"`kind` must be 'dicts' or 'imitation', got {kind!r}")
     actions, lengths = plans.actions.long().cpu().numpy(), plans.mask().sum(1).tolist()
     context = plans.context
-    found = [{"actions": row[:length].copy()} for row, length in zip(actions, lengths, strict=True)]
+    trajectories = [{"actions": row[:length].copy()} for row, length in zip(actions, lengths, strict=True)]
     if context is not None:
-        for trajectory, row, length in zip(found, context.detach().cpu().numpy(), lengths, strict=True):
+        for trajectory, row, length in zip(trajectories, context.detach().cpu().numpy(), lengths, strict=True):
             trajectory["observations"] = row[:length].copy()
     if kind == "dicts":
-        return found
+        return trajectories
     if context is None:
         raise ValueError("plans: no context; imitation's trajectories need an observation for each step")
     if lengths and not min(lengths):
         raise ValueError(f"plans: plan {lengths.index(0)} has no actions; imitation's trajectories need some")
-    made = import_module("imitation.data.types").Trajectory
+    trajectory_class = import_module("imitation.data.types").Trajectory
     return [
-        made(
+        trajectory_class(
             obs=np.concatenate([one["observations"], one["observations"][-1:]]),
             acts=one["actions"],
             infos=None,
             terminal=True,
         )
-        for one in found
+        for one in trajectories
     ]
 
 
@@ -176,26 +176,26 @@ def observations_of(values: Any, length: int, place: str) -> NDArray[Any]:
 
 def joined(observed: list[NDArray[Any] | None]) -> NDArray[Any] | None:
     """All observations end to end: `[S]` or `[S, C]`, or None where there are none."""
-    parts = [(i, part) for i, part in enumerate(observed) if part is not None]
+    parts = [(i, values) for i, values in enumerate(observed) if values is not None]
     if not parts:
         return None
     if len(parts) < len(observed):
-        missing = next(i for i, part in enumerate(observed) if part is None)
+        missing = next(i for i, values in enumerate(observed) if values is None)
         raise ValueError(f"trajectory {missing}: no observations, which trajectory {parts[0][0]} has")
     # Of a trajectory without steps the kind of its observations is not known.
-    parts = [(i, part) for i, part in parts if len(part)] or parts[:1]
+    parts = [(i, values) for i, values in parts if len(values)] or parts[:1]
     number, first = parts[0]
-    for i, part in parts:
-        if part.shape[1:] != first.shape[1:] or part.dtype.kind != first.dtype.kind:
+    for i, values in parts:
+        if values.shape[1:] != first.shape[1:] or values.dtype.kind != first.dtype.kind:
             raise ValueError(
-                f"trajectory {i}: observations of another kind than trajectory {number}: {_kind(part)}, not"
+                f"trajectory {i}: observations of another kind than trajectory {number}: {_kind(values)}, not"
                 f" {_kind(first)}"
             )
-    return np.concatenate([part for _, part in parts])
+    return np.concatenate([values for _, values in parts])
 
 
-def _kind(part: NDArray[Any]) -> str:
-    return "integers" if part.ndim == 1 else f"{part.shape[1]} features"
+def _kind(observations: NDArray[Any]) -> str:
+    return "integers" if observations.ndim == 1 else f"{observations.shape[1]} features"
 
 
 def array_of(values: Any, place: str) -> NDArray[Any]:
