@@ -216,8 +216,8 @@ def _sample_in_world(
         children = draw.split(counts, legal_logits(world, now, logits))
         row, action = children.nonzero(as_tuple=True)
         counts = children[row, action]
-        root, hidden, now = _taken(row, root, hidden, now)
-        begun = [_taken(row, *column) for column in begun]
+        root, hidden, now = _select_each(row, root, hidden, now)
+        begun = [_select_each(row, *column) for column in begun]
         now, reward = step_alive(world, now, action, generator)
         for column, values in zip(begun, (action.to(draw.dtype), reward, now), strict=True):
             column.append(values)
@@ -233,26 +233,26 @@ def _sample_in_world(
     parts = _parts(len(row), logits, hidden, shares) if shares else [slice(0, len(row))]
     ends: dict[int, tuple[Tensor, list[list[Tensor]]]] = {}  # last states and columns of each part
 
-    def draw_part(number: int) -> None:
-        some = row[parts[number]]
-        own = [_taken(some, *column) for column in begun]
-        plans, (here, after, memory) = _begun(some, draw, uniform is not None, now, logits, hidden)
+    def draw_chunk(number: int) -> None:
+        rows = row[parts[number]]
+        history = [_select_each(rows, *column) for column in begun]
+        plans, (current, after, memory) = _begin_prefixes(rows, draw, uniform is not None, now, logits, hidden)
         for k in range(len(steps)):
-            given = None if uniform is None else uniform[k, parts[number]]
-            action = draw.actions(legal_logits(world, here, after), given, plans.row)
+            numbers = None if uniform is None else uniform[k, parts[number]]
+            action = draw.actions(legal_logits(world, current, after), numbers, plans.row)
             parent, last = plans.extend(action)
             if parent is not None:
-                here, memory = _taken(parent, here, memory)
-            here, reward = step_alive(world, here, last, generator)
-            own[0].append(action.to(draw.dtype))
-            own[1].append(plans.of_each(reward))
+                current, memory = _select_each(parent, current, memory)
+            current, reward = step_alive(world, current, last, generator)
+            history[0].append(action.to(draw.dtype))
+            history[1].append(plans.of_each(reward))
             if keep_states:
-                own[2].append(plans.of_each(here))
+                history[2].append(plans.of_each(current))
             if k + 1 < len(steps):
-                after, memory = stepper.step_in(world, last, memory, here)
-        ends[number] = plans.of_each(here), own
+                after, memory = stepper.step_in(world, last, memory, current)
+        ends[number] = plans.of_each(current), history
 
-    share(draw_part, range(len(parts)))
+    share(draw_chunk, range(len(parts)))
     final = torch.cat([ends[number][0] for number in range(len(parts))])
     columns = zip(*(ends[number][1] for number in range(len(parts))), strict=True)
     joined = [[torch.cat(of) for of in zip(*column, strict=True)] for column in columns]
@@ -274,15 +274,15 @@ def _parts(number: int, logits: Tensor, state: State, shares: bool) -> list[slic
         parts = max(-(-number // together), 1)
         if shares and number >= 2 * FEWEST:
             parts = -(-parts // torch.get_num_threads()) * torch.get_num_threads()
-    return [slice(number * part // parts, number * (part + 1) // parts) for part in range(parts)]
+    return [slice(number * k // parts, number * (k + 1) // parts) for k in range(parts)]
 
 
-def _taken(row: Tensor, *states: Any) -> list[Any]:
+def _select_each(row: Tensor, *states: Any) -> list[Any]:
     """The rows `row` of each tensor or state."""
     return [select_rows(state, row) for state in states]
 
 
-def _begun(row: Tensor, draw: Draw, shared: bool, *states: Any) -> tuple[Prefixes, list[Any]]:
+def _begin_prefixes(row: Tensor, draw: Draw, shared: bool, *states: Any) -> tuple[Prefixes, list[Any]]:
     """Plans that go on from rows `row [N]` of tensors or states, and of these the rows from the first to the last.
 
     Those that begin alike are stepped once where they are `shared`, unless they are few for the device.
@@ -353,7 +353,7 @@ def _sample_masked(
     plans = torch.empty(len(row), length, dtype=torch.long, device=row.device)
     logits, state = logits[row], select_rows(state, row)
     for t in range(length):
-        allowed = _allowed(mask, plans, t, draw.num_actions).to(logits.device)
+        allowed = _allowed_actions(mask, plans, t, draw.num_actions).to(logits.device)
         if not allowed.any(-1).all():
             raise ValueError(f"`mask` must allow an action in each plan, got none at step {t}")
         plans[:, t] = draw.actions(logits.masked_fill(~allowed, -torch.inf))
@@ -363,7 +363,7 @@ def _sample_masked(
     return plans.to(draw.dtype)
 
 
-def _allowed(mask: Tensor | Mask, plans: Tensor, step: int, num_actions: int) -> Tensor:
+def _allowed_actions(mask: Tensor | Mask, plans: Tensor, step: int, num_actions: int) -> Tensor:
     """Which actions may be drawn next, bool `[A]` or `[N, A]`, in `plans [N, L]` of which `step` actions are drawn."""
     num_plans, length = plans.shape
     allowed = mask(plans[:, :step]) if callable(mask) else mask
@@ -413,7 +413,7 @@ def _sample_from_roots(
         children = draw.split(counts, logits)
         parent, action = children.nonzero(as_tuple=True)
         counts = children[parent, action]
-        prefix, root = _taken(parent, prefix, root)
+        prefix, root = _select_each(parent, prefix, root)
         prefix = torch.cat([prefix, action[:, None].to(draw.dtype)], 1)
         if prefix.shape[1] < length:
             logits, state = stepper.step(action, select_rows(state, parent))
@@ -424,8 +424,8 @@ def _sample_from_roots(
     plans = torch.empty(total, length, dtype=draw.dtype, device=counts.device)
     plans[:, :depth] = begun
     for at in range(0, total, batch_size):
-        some, here = row[at : at + batch_size], slice(at, at + batch_size)
-        plans[here, depth:] = _sample_one_by_one(stepper, some, logits, state, context, range(depth, length), draw)
+        rows, span = row[at : at + batch_size], slice(at, at + batch_size)
+        plans[span, depth:] = _sample_one_by_one(stepper, rows, logits, state, context, range(depth, length), draw)
     return plans
 
 
@@ -436,27 +436,27 @@ def _sample_one_by_one(
     actions = torch.empty(len(row), len(steps), dtype=draw.dtype, device=row.device)
     uniform = draw.uniform((len(steps), len(row)), logits)
 
-    def draw_part(part: slice) -> None:
-        plans, (now, hidden) = _begun(row[part], draw, context is None, logits, state)
+    def draw_chunk(span: slice) -> None:
+        plans, (now, hidden) = _begin_prefixes(row[span], draw, context is None, logits, state)
         for k, t in enumerate(steps):
-            action = draw.actions(now, uniform[k, part], plans.row)
-            actions[part, k] = action
+            action = draw.actions(now, uniform[k, span], plans.row)
+            actions[span, k] = action
             if k + 1 < len(steps):
                 parent, last = plans.extend(action)
                 if parent is not None:
                     hidden = select_rows(hidden, parent)
                 if plans.row is None and context is None:
-                    rest = stepper.draw_rest(last, hidden, uniform[k + 1 :, part], draw.temperature)
+                    rest = stepper.draw_rest(last, hidden, uniform[k + 1 :, span], draw.temperature)
                     if rest is not None:
-                        actions[part, k + 1 :] = rest
+                        actions[span, k + 1 :] = rest
                         return
-                given = None if context is None else context[row[part], t + 1]
-                now, hidden = stepper.step(last, hidden, given)
+                next_context = None if context is None else context[row[span], t + 1]
+                now, hidden = stepper.step(last, hidden, next_context)
 
     parts = _parts(len(row), logits, state, stepper.shares)
     if stepper.shares:
-        share(draw_part, parts)
+        share(draw_chunk, parts)
     else:
-        for part in parts:
-            draw_part(part)
+        for span in parts:
+            draw_chunk(span)
     return actions

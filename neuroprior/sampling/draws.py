@@ -88,9 +88,9 @@ class Draw:
         left = counts.double()
         parts = []
         for action in range(self.num_actions):
-            part = torch.binomial(left, share[:, action].contiguous(), generator=self.generator)
-            parts.append(part)
-            left = left - part
+            count = torch.binomial(left, share[:, action].contiguous(), generator=self.generator)
+            parts.append(count)
+            left = left - count
         return torch.stack(parts, -1).long()
 
 

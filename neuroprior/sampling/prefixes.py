@@ -43,11 +43,11 @@ class Prefixes:
             pair = row.long() * self._num_actions + action
             begun = torch.zeros(self._number * self._num_actions, dtype=torch.bool, device=row.device)
             begun[pair] = True
-            found = begun.nonzero()[:, 0]
-            if 2 * len(found) <= len(row):
+            pairs = begun.nonzero()[:, 0]
+            if 2 * len(pairs) <= len(row):
                 number = torch.empty(len(begun), dtype=row.dtype, device=row.device)
-                number[found] = torch.arange(len(found), dtype=row.dtype, device=row.device)
-                self.row, self._number = number.index_select(0, pair), len(found)
-                return found // self._num_actions, found % self._num_actions
+                number[pairs] = torch.arange(len(pairs), dtype=row.dtype, device=row.device)
+                self.row, self._number = number.index_select(0, pair), len(pairs)
+                return pairs // self._num_actions, pairs % self._num_actions
         self.row = None
         return row, action

@@ -48,13 +48,13 @@ def join_rows(*states: State) -> State:
 
 def tensors_in(state: State) -> list[Tensor]:
     """Returns all tensors of a state, in order."""
-    return [state] if isinstance(state, Tensor) else [values for part in state for values in tensors_in(part)]
+    return [state] if isinstance(state, Tensor) else [values for inner in state for values in tensors_in(inner)]
 
 
 def has_rows(state: State, num: int) -> bool:
     """Returns whether a state is one of `num` plans: a tensor of so many rows, or a tuple of such states."""
     if isinstance(state, tuple):
-        return len(state) > 0 and all(has_rows(part, num) for part in state)
+        return len(state) > 0 and all(has_rows(inner, num) for inner in state)
     return isinstance(state, Tensor) and state.dim() > 0 and len(state) == num
 
 
@@ -88,7 +88,7 @@ class StateStore:
             if kept is not None:
                 map_state(lambda more, old: more[:first].copy_(old[:first]), room, kept)
             self._states[depth] = kept = room
-        map_state(lambda all_, some: all_[first:last].copy_(some), kept, state)
+        map_state(lambda all_, values: all_[first:last].copy_(values), kept, state)
         self._used[depth] = last
         return torch.arange(first, last)
 

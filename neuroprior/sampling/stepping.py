@@ -161,7 +161,7 @@ class Stepper:
 
     def step_in(self, world: World, action: Tensor, state: State, reached: Tensor) -> tuple[Tensor, State]:
         """As `step`, after `action` led to the world's states `reached [N, ...]`; each is observed once."""
-        if self.context_per == "step" and self._step_shared is not None and _numbered(reached):
+        if self.context_per == "step" and self._step_shared is not None and _are_numbers(reached):
             pair, row = (reached * self.num_actions + action).unique(return_inverse=True)
             context, action = world.context(pair // self.num_actions), pair % self.num_actions
             with self.threads_for(len(row)):
@@ -198,7 +198,7 @@ def check_logits(logits: Any, shape: list[int], method: str) -> Tensor:
     return as_single(logits)
 
 
-def _numbered(reached: Tensor) -> bool:
+def _are_numbers(reached: Tensor) -> bool:
     """Whether states are numbers, and enough of them that finding the distinct ones pays."""
     enough = len(reached) >= FEWEST_TO_SHARE and not are_few(len(reached), reached.device)
     return reached.dim() == 1 and is_integer(reached) and enough
