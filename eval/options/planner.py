@@ -47,16 +47,16 @@ class OptionPlanner(SamplingPlanner):
         super().__init__(prior, length, num_plans, **how)
         self.options, self.terminations = prior, terminations
 
-    def _drawn(
+    def _draw(
         self, prior: Steppable, number: int, temperature: float, world: World, state: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, Rollout | None]:
         how = temperature, world, state, generator
         if prior is not self.options:
-            return super()._drawn(prior, number, *how)
+            return super()._draw(prior, number, *how)
         modes = range(min(self.options.num_modes, number))
         counts = [len(range(mode, number, self.options.num_modes)) for mode in modes]
         begun = [self.options.beginning_in(mode, keep=not self.terminations) for mode in modes]
-        drawn = [super(OptionPlanner, self)._drawn(one, n, *how) for one, n in zip(begun, counts, strict=True)]
+        drawn = [super(OptionPlanner, self)._draw(one, n, *how) for one, n in zip(begun, counts, strict=True)]
         # By turns: the first candidate of each mode, then the second of each.
         order = torch.cat([torch.arange(n) for n in counts]).argsort(stable=True).to(state.device)
 

@@ -51,7 +51,7 @@ class Nodes(NamedTuple):
     high: Array
 
 
-class Known(NamedTuple):
+class Trees(NamedTuple):
     """What is kept of each node beside `Nodes`, and of each start, where the loop steps the world and the prior.
 
     Attributes:
@@ -176,19 +176,19 @@ def back_up(nodes: Nodes, rows: Array, path: Array, plan: Array, score: Array) -
     """Count plans `[K, L]` and their scores (float64) at the nodes of their `path [K, L]` (-1: outside of the tree)."""
     actions = nodes.child.shape[2]
     for k in range(len(rows)):
-        b, own = rows[k], score[k]
-        if np.isfinite(own):
-            nodes.low[b], nodes.high[b] = min(nodes.low[b], own), max(nodes.high[b], own)
+        b, worth = rows[k], score[k]
+        if np.isfinite(worth):
+            nodes.low[b], nodes.high[b] = min(nodes.low[b], worth), max(nodes.high[b], worth)
         else:  # counts as the lowest, or highest, finite one so far
-            own = nodes.high[b] if own > 0 else nodes.low[b]
-            own = own if np.isfinite(own) else 0.0
+            worth = nodes.high[b] if worth > 0 else nodes.low[b]
+            worth = worth if np.isfinite(worth) else 0.0
         finished = path[k, -1] >= 0  # after the last action there is nothing more to try
         for t in range(path.shape[1] - 1, -1, -1):
             node = path[k, t]
             if node < 0:
                 continue
             nodes.visits[b, node, plan[k, t]] += 1
-            nodes.total[b, node, plan[k, t]] += own
+            nodes.total[b, node, plan[k, t]] += worth
             nodes.closed[b, node, plan[k, t]] |= finished
             finished = True
             for a in range(actions):
@@ -304,7 +304,7 @@ class Room(NamedTuple):
     block: Any
 
 
-class Found(NamedTuple):
+class Simulations(NamedTuple):
     """What comes of the simulations: `[N, B, L]` plans, the reward of each step (float64) and the state after it, and
     which plans there are: bool `[N, B]`."""
 
@@ -315,7 +315,7 @@ class Found(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def begin(nodes: Nodes, known: Known, exploration: float, draws: Array, descent: Descent) -> tuple[int, int]:
+def begin(nodes: Nodes, trees: Trees, exploration: float, draws: Array, descent: Descent) -> tuple[int, int]:
     """Descend in the trees of the starts that may be extended.
 
     Returns:
@@ -323,22 +323,22 @@ def begin(nodes: Nodes, known: Known, exploration: float, draws: Array, descent:
     """
     rows, path, plan, depth, first = descent
     number = 0
-    for b in range(len(known.left)):
-        if known.left[b] > 0 and not known.over[b] and not nodes.closed[b, 0].all():
+    for b in range(len(trees.left)):
+        if trees.left[b] > 0 and not trees.over[b] and not nodes.closed[b, 0].all():
             rows[number] = b
             number += 1
     if len(draws) < number * path.shape[1] * (1 + nodes.child.shape[2]):
         number = 0
     if number == 0:
         return 0, 0
-    given = rows[:number], exploration, draws, path[:number], plan[:number], depth[:number], first
-    return number, descend(nodes, *given)
+    descent_arguments = rows[:number], exploration, draws, path[:number], plan[:number], depth[:number], first
+    return number, descend(nodes, *descent_arguments)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def follow(
     nodes: Nodes,
-    known: Known,
+    trees: Trees,
     moves: Moves,
     policy: Policy,
     discounts: Array,
@@ -351,12 +351,12 @@ def follow(
     draws: Array,
     first: Array,
     room: Room,
-    found: Found,
+    simulations: Simulations,
 ) -> None:
     """Follow plans to their ends, one from each of the starts `rows [K]`, and count them in the trees.
 
     Args:
-        nodes, known: the trees; extended.
+        nodes, trees: see the classes; extended.
         moves, policy: the world and the prior.
         discounts: float64 `[L]`: weights of rewards in a return; empty: the last reward counts.
         any_prefix: whether a plan is worth its best prefix.
@@ -365,21 +365,21 @@ def follow(
         draws: float32: uniform numbers; that of row k at step t is `first[t] + k`.
         first: int64 `[L]`.
         room: for K plans.
-        found: gets the plans.
+        simulations: gets the plans.
     """
-    length, actions, size = path.shape[1], nodes.child.shape[2], known.hidden.shape[2]
+    length, actions, size = path.shape[1], nodes.child.shape[2], trees.hidden.shape[2]
     alive, score, cell, observed, code, hidden, weights, probs, which, block = room
     for k in range(len(rows)):
         b = rows[k]
         # A plan that the budget does not allow to the end is not begun.
-        alive[k] = known.left[b] >= length - depth[k]
-        known.over[b] |= not alive[k]
-        found.done[simulation, b] = alive[k]
-        observed[k] = known.state[b, 0]
+        alive[k] = trees.left[b] >= length - depth[k]
+        trees.over[b] |= not alive[k]
+        simulations.done[simulation, b] = alive[k]
+        observed[k] = trees.state[b, 0]
         for t in range(depth[k]):
             child = path[k, t + 1]
-            found.states[simulation, b, t] = known.state[b, child]
-            found.rewards[simulation, b, t] = known.reward[b, child]
+            simulations.states[simulation, b, t] = trees.state[b, child]
+            simulations.rewards[simulation, b, t] = trees.reward[b, child]
     for t in range(length):
         going = 0
         for k in range(len(rows)):
@@ -388,9 +388,9 @@ def follow(
             b, action = rows[k], plan[k, t]
             if depth[k] == t:
                 node = path[k, t]
-                cell[k], code[k] = known.state[b, node], known.code[b, node]
+                cell[k], code[k] = trees.state[b, node], trees.code[b, node]
                 for j in range(size):
-                    hidden[k, j] = known.hidden[b, node, j]
+                    hidden[k, j] = trees.hidden[b, node, j]
             else:
                 total, action = weights[k, actions - 1], 0
                 mark = draws[first[t] + k] * total
@@ -402,8 +402,8 @@ def follow(
             taken = at * actions + action
             cell[k] = moves.after[taken] + maps
             gained = moves.reward[cell[k] if moves.on_arrival else taken + maps * actions]
-            found.states[simulation, b, t], found.rewards[simulation, b, t] = cell[k], gained
-            known.left[b] -= 1
+            simulations.states[simulation, b, t], simulations.rewards[simulation, b, t] = cell[k], gained
+            trees.left[b] -= 1
             if policy.each_step:
                 observed[k] = cell[k]
             which[going] = k
@@ -415,17 +415,17 @@ def follow(
             if depth[k] != t:
                 continue
             b = rows[k]
-            new = known.size[b]
-            known.size[b] += 1
+            new = trees.size[b]
+            trees.size[b] += 1
             nodes.child[b, path[k, t], plan[k, t]] = new
             # Number by number: an assignment of rows takes numba longer to compile, since it words an error of shapes.
             for a in range(actions):
                 nodes.child[b, new, a], nodes.visits[b, new, a], nodes.total[b, new, a] = 0, 0, 0.0
                 nodes.closed[b, new, a], nodes.probs[b, new, a] = False, probs[k, a]
-            known.state[b, new], known.reward[b, new] = cell[k], found.rewards[simulation, b, t]
-            known.code[b, new] = code[k]
+            trees.state[b, new], trees.reward[b, new] = cell[k], simulations.rewards[simulation, b, t]
+            trees.code[b, new] = code[k]
             for j in range(size):
-                known.hidden[b, new, j] = hidden[k, j]
+                trees.hidden[b, new, j] = hidden[k, j]
     going = 0
     for k in range(len(rows)):
         if not alive[k]:
@@ -433,8 +433,8 @@ def follow(
         b = rows[k]
         total, best = 0.0, -np.inf
         for t in range(length):
-            found.plans[simulation, b, t] = plan[k, t]
-            gained = found.rewards[simulation, b, t]
+            simulations.plans[simulation, b, t] = plan[k, t]
+            gained = simulations.rewards[simulation, b, t]
             total = total + gained * discounts[t] if len(discounts) else gained
             best = max(best, total)
             path[going, t], plan[going, t] = path[k, t], plan[k, t]
@@ -446,7 +446,7 @@ def follow(
 @njit(cache=True, nogil=True, error_model="numpy")
 def search(
     nodes: Nodes,
-    known: Known,
+    trees: Trees,
     moves: Moves,
     policy: Policy,
     discounts: Array,
@@ -455,12 +455,12 @@ def search(
     draws: Array,
     descent: Descent,
     room: Room,
-    found: Found,
+    simulations: Simulations,
 ) -> tuple[int, int]:
     """Simulate plans, one from each unfinished start at a time: all on one thread.
 
     Args:
-        nodes, known, moves, policy, discounts, any_prefix, room, found: see `follow`.
+        nodes, trees, moves, policy, discounts, any_prefix, room, simulations: see `follow`.
         exploration: c.
         draws: float32: uniform numbers.
         descent: room for all starts.
@@ -471,18 +471,18 @@ def search(
     """
     rows, path, plan, depth, first = descent
     used = 0
-    for simulation in range(len(found.plans)):
-        own = draws[used:]
-        number, taken = begin(nodes, known, exploration, own, descent)
+    for simulation in range(len(simulations.plans)):
+        unused = draws[used:]
+        number, taken = begin(nodes, trees, exploration, unused, descent)
         if number == 0:
             return simulation, used
         used += taken
-        found.done[simulation] = False
+        simulations.done[simulation] = False
         follow(
-            nodes, known, moves, policy, discounts, any_prefix, simulation,
-            rows[:number], path[:number], plan[:number], depth[:number], own, first, room, found,
+            nodes, trees, moves, policy, discounts, any_prefix, simulation,
+            rows[:number], path[:number], plan[:number], depth[:number], unused, first, room, simulations,
         )  # fmt: skip
-    return len(found.plans), used
+    return len(simulations.plans), used
 
 
 def search_all(
@@ -502,7 +502,7 @@ def _search_all(
     steps = planner.num_plans * length
     policy = policy_of(planner.prior, world, planner.temperature)
     parts = policy.probs, policy.by_context, *policy.network
-    check_possible(not any(np.isnan(part).any() for part in parts))
+    check_possible(not any(np.isnan(array).any() for array in parts))
     logits, hidden = Stepper(planner.prior).start_in(world, state)
     (layers, size, _), most = policy.network.recurrent.shape, batch * length * (1 + actions)
     room, number = max(min(DRAWS // most, 2 * planner.num_plans), 1), 0
@@ -511,18 +511,18 @@ def _search_all(
         np.empty(shape, np.int64), np.empty(shape, np.int32), np.empty(shape), np.empty(shape, np.bool_),
         np.empty(shape), np.full(batch, np.inf), np.full(batch, -np.inf),
     )  # fmt: skip
-    known = Known(
+    trees = Trees(
         np.empty(shape[:2], np.int64), np.empty(shape[:2]), np.empty(shape[:2], np.int64),
         np.empty((*shape[:2], layers * size), np.float32), np.ones(batch, np.int64), np.full(batch, steps),
         np.zeros(batch, np.bool_),
     )  # fmt: skip
     nodes.child[:, 0], nodes.visits[:, 0], nodes.total[:, 0], nodes.closed[:, 0] = 0, 0, 0, False
     nodes.probs[:, 0] = (logits.double() / planner.temperature).softmax(1).numpy()
-    known.state[:, 0] = state.numpy()
-    known.code[:, 0] = int(planner.prior.start_node) if isinstance(planner.prior, HistoryPrior) else 0
+    trees.state[:, 0] = state.numpy()
+    trees.code[:, 0] = int(planner.prior.start_node) if isinstance(planner.prior, HistoryPrior) else 0
     if isinstance(planner.prior, GRUPrior):
         layers_state, _ = hidden[1] if planner.prior.takes_context else hidden
-        known.hidden[:, 0] = layers_state.flatten(1).numpy()
+        trees.hidden[:, 0] = layers_state.flatten(1).numpy()
     moves = Moves(
         world.next_state.view(-1).numpy(), world.reward.reshape(-1).numpy(), world.reward.dim() == 2, world.num_states
     )
@@ -539,64 +539,66 @@ def _search_all(
     results = list[tuple[Tensor, ...]]()
     with ThreadPoolExecutor(threads) if threads > 1 else nullcontext() as pool:
         while not results or number == room:
-            if known.size.max() + room > nodes.child.shape[1]:  # each simulation adds a node
-                nodes, known = Nodes(*map(_widened, nodes)), Known(*map(_widened, known))
+            if trees.size.max() + room > nodes.child.shape[1]:  # each simulation adds a node
+                nodes, trees = Nodes(*map(_widen, nodes)), Trees(*map(_widen, trees))
             kinds = action_dtype(actions), torch.float64, torch.int64
             out = *(torch.empty(room, batch, length, dtype=kind) for kind in kinds), torch.empty(room, batch) > 0
             before = generator.get_state()
             draws = torch.rand(room * most, generator=generator)
-            found = Found(*(part.numpy() for part in out))
+            simulations = Simulations(*(column.numpy() for column in out))
             if pool is None:
                 number, used = search(
-                    nodes, known, moves, policy, discounts, planner.any_prefix, planner.exploration, draws.numpy(),
-                    descent, rooms[0], found,
+                    nodes, trees, moves, policy, discounts, planner.any_prefix, planner.exploration, draws.numpy(),
+                    descent, rooms[0], simulations,
                 )  # fmt: skip
             else:
-                given = nodes, known, moves, policy, discounts, planner.any_prefix
-                number, used = _search_shared(pool, given, planner.exploration, draws.numpy(), descent, rooms, found)
+                arguments = nodes, trees, moves, policy, discounts, planner.any_prefix
+                number, used = _search_shared(
+                    pool, arguments, planner.exploration, draws.numpy(), descent, rooms, simulations
+                )
             generator.set_state(before)
             torch.rand(used, generator=generator)  # those that were not used are given back
-            results.append(tuple(part[:number] for part in out))
-    plans, rewards, states, done = (torch.cat(some).transpose(0, 1) for some in zip(*results, strict=True))
-    taken = int(steps - known.left.min())
+            results.append(tuple(column[:number] for column in out))
+    plans, rewards, states, done = (torch.cat(chunks).transpose(0, 1) for chunks in zip(*results, strict=True))
+    taken = int(steps - trees.left.min())
     return plans, rewards.to(world.reward.dtype), states if planner.any_prefix else states[:, :, -1:], done, taken
 
 
 def _search_shared(
     pool: ThreadPoolExecutor,
-    given: tuple[Any, ...],
+    arguments: tuple[Any, ...],
     exploration: float,
     draws: Array,
     descent: Descent,
     rooms: list[Room],
-    found: Found,
+    simulations: Simulations,
 ) -> tuple[int, int]:
     """As `search`, where threads share what comes after each descent: the same plans, since one draws the numbers.
 
     Args:
         pool: the threads.
-        given: the first six arguments of `follow`.
-        exploration, draws, descent, found: as for `search`.
+        arguments: the first six of `follow`.
+        exploration, draws, descent, simulations: as for `search`.
         rooms: room for each part of the starts.
     """
-    nodes, known = given[:2]
+    nodes, trees = arguments[:2]
     to_the_end: Any = follow
     used = 0
-    for simulation in range(len(found.plans)):
-        own = draws[used:]
-        number, taken = begin(nodes, known, exploration, own, descent)
+    for simulation in range(len(simulations.plans)):
+        unused = draws[used:]
+        number, taken = begin(nodes, trees, exploration, unused, descent)
         if number == 0:
             return simulation, used
         used += taken
-        found.done[simulation] = False
+        simulations.done[simulation] = False
         on_the_way, each = [x[:number] for x in descent[:4]], -(-number // len(rooms))
 
-        def part(at: int) -> None:
-            some = [x[at : at + each] for x in on_the_way]  # noqa: B023
-            to_the_end(*given, simulation, *some, own[at:], descent.first, rooms[at // each], found)  # noqa: B023
+        def follow_chunk(at: int) -> None:
+            chunk = [x[at : at + each] for x in on_the_way]  # noqa: B023
+            to_the_end(*arguments, simulation, *chunk, unused[at:], descent.first, rooms[at // each], simulations)  # noqa: B023
 
-        list(pool.map(part, range(0, number, each)))
-    return len(found.plans), used
+        list(pool.map(follow_chunk, range(0, number, each)))
+    return len(simulations.plans), used
 
 
 def _room(number: int, layers: int, size: int, actions: int) -> Room:
@@ -613,7 +615,7 @@ def _room(number: int, layers: int, size: int, actions: int) -> Room:
     )  # fmt: skip
 
 
-def _widened(values: Array) -> Array:
+def _widen(values: Array) -> Array:
     """Numbers of nodes, `[B, M, ...]`, with room for twice as many; those of starts, `[B]`, are left alone."""
     return values if values.ndim == 1 else np.concatenate([values, np.empty_like(values)], 1)
 
@@ -623,9 +625,9 @@ def can_search(planner: PriorPlanner, world: World, state: Tensor) -> bool:
     prior = planner.prior
     if not isinstance(world, TabularWorld) or getattr(world.step, "__func__", None) is not TabularWorld.step:
         return False
-    known = world.all_legal and world.outcomes is None and planner.value is None
-    known = known and world.reward.dtype in (torch.float32, torch.float64) and state.device.type == "cpu"
-    if not known or len(state) == 0 or not _knows(prior) or Stepper(prior).device != state.device:
+    supported = world.all_legal and world.outcomes is None and planner.value is None
+    supported = supported and world.reward.dtype in (torch.float32, torch.float64) and state.device.type == "cpu"
+    if not supported or len(state) == 0 or not _knows(prior) or Stepper(prior).device != state.device:
         return False
     rows = len(prior.next_node) * (prior.num_contexts or 1) if isinstance(prior, HistoryPrior) else 0
     if getattr(prior, "context_per", None) is not None:
@@ -638,8 +640,12 @@ def _knows(prior: Steppable) -> bool:
     if type(prior) is UniformPrior:
         return True
     if isinstance(prior, HistoryPrior):
-        own = type(prior)
-        return own.start is HistoryPrior.start and own.step is HistoryPrior.step and own._at is HistoryPrior._at
+        kind = type(prior)
+        return (
+            kind.start is HistoryPrior.start
+            and kind.step is HistoryPrior.step
+            and kind._outputs_at is HistoryPrior._outputs_at
+        )
     return isinstance(prior, GRUPrior) and not prior.training and prior.is_plain
 
 
@@ -666,7 +672,7 @@ def policy_of(prior: Any, world: TabularWorld, temperature: float) -> Policy:
     weights = ((logits - logits.amax(1, keepdim=True)) / temperature).exp().T.cumsum(0).T
     probs = (logits.double() / temperature).softmax(1)
     kinds = (torch.int64, torch.int64, torch.float32, torch.float64, torch.float32)
-    given = zip((after, row, weights, probs, by_context), kinds, strict=True)
-    tables: Any = [x.detach().to(kind).contiguous().numpy() for x, kind in given]
+    pairs = zip((after, row, weights, probs, by_context), kinds, strict=True)
+    tables: Any = [x.detach().to(kind).contiguous().numpy() for x, kind in pairs]
     parts: Any = (context.numpy(), each_step, *tables, Network(*network), float(temperature))
     return Policy(*parts)

@@ -131,7 +131,7 @@ def expected_score(
         lengths.reshape(-1).split(size),
         strict=True,
     )
-    scores = [table.scores(*some, objective == "terminal", discount) for some in rows]
+    scores = [table.scores(*chunk, objective == "terminal", discount) for chunk in rows]
     return torch.cat(scores).view(batch, num_plans).to(world.reward.dtype)
 
 
@@ -159,11 +159,11 @@ class _Table:
             reward = _mean(share, self.reward.index_select(0, reward_map * world.num_actions + action))
             counts = lengths == t + 1 if terminal else executed
             score = torch.where(counts, score + discount**t * reward, score)
-            share = torch.where(executed[:, None], self._after(share, action), share)
+            share = torch.where(executed[:, None], self._propagate(share, action), share)
         weight = 1.0 if terminal else discount ** lengths.double()
         return score + weight * _mean(share, self.worth.index_select(0, reward_map))
 
-    def _after(self, share: Tensor, action: Tensor) -> Tensor:
+    def _propagate(self, share: Tensor, action: Tensor) -> Tensor:
         """The probability of each cell after one more `action [N]`."""
         to = self.next_state.index_select(0, action)
         outcomes = to.shape[1] // share.shape[1]

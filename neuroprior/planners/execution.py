@@ -71,9 +71,9 @@ def execute(
     parts = []
     for at in range(0, num_steps, replan_every):
         decision = planner.plan(world, state, generator)
-        part = follow(decision, world, state, min(replan_every, num_steps - at), generator, change)
-        state = part.states[:, -1]
-        parts.append(part)
+        execution = follow(decision, world, state, min(replan_every, num_steps - at), generator, change)
+        state = execution.states[:, -1]
+        parts.append(execution)
     return join_executions(parts)
 
 
@@ -179,9 +179,9 @@ def follow(
 def join_executions(parts: Sequence[Execution]) -> Execution:
     """Executions one after another, as one."""
     actions, rewards, states = (
-        torch.cat([getattr(part, name) for part in parts], 1) for name in ("actions", "rewards", "states")
+        torch.cat([getattr(execution, name) for execution in parts], 1) for name in ("actions", "rewards", "states")
     )
-    return Execution(actions, rewards, states, sum(part.model_steps for part in parts))
+    return Execution(actions, rewards, states, sum(execution.model_steps for execution in parts))
 
 
 def observations(world: World, before: Tensor, context: Literal["plan", "step"] | None) -> Tensor | None:
@@ -210,12 +210,12 @@ def check_change(change: object) -> None:
         raise ValueError(f"`change` must be a function of states and a generator, got {change!r}")
 
 
-def _changed(change: Change, state: Tensor, generator: torch.Generator | None) -> Tensor:
+def _apply_change(change: Change, state: Tensor, generator: torch.Generator | None) -> Tensor:
     """The states after a change; raises ValueError where these are no such states."""
     after: object = change(state, generator)
     if not isinstance(after, Tensor) or after.shape != state.shape or after.dtype != state.dtype:
-        found = f"{after.dtype} {list(after.shape)}" if isinstance(after, Tensor) else kind_of(after)
-        raise ValueError(f"`change` must be {state.dtype} {list(state.shape)}, states as given, got {found}")
+        got = f"{after.dtype} {list(after.shape)}" if isinstance(after, Tensor) else kind_of(after)
+        raise ValueError(f"`change` must be {state.dtype} {list(state.shape)}, states as given, got {got}")
     return after
 
 
@@ -228,7 +228,7 @@ def _step_through(
         return torch.zeros(plans.shape, device=state.device), state[:, None][:, :0]
     for t in range(plans.shape[1]):
         state, reward = step_alive(world, state, plans[:, t].long(), generator)
-        state = state if change is None else _changed(change, state, generator)
+        state = state if change is None else _apply_change(change, state, generator)
         rewards.append(reward)
         states.append(state)
     return torch.stack(rewards, 1), torch.stack(states, 1)

@@ -49,11 +49,11 @@ class ExhaustivePlanner(Planner):
         world.check_state(state)
         planner, generator = self.for_world(world), generator_on(generator, state.device)
         if world.stochastic:
-            plan_some, steps = planner._plan_apart, self.num_rollouts * self.depth * (actions**self.depth + 1)
+            plan_chunk, steps = planner._plan_apart, self.num_rollouts * self.depth * (actions**self.depth + 1)
         else:
-            plan_some, steps = planner._plan_together, sum(actions**depth for depth in range(1, self.depth + 1))
+            plan_chunk, steps = planner._plan_together, sum(actions**depth for depth in range(1, self.depth + 1))
         chunks = self.chunks(state, steps, cached=not world.stochastic)
-        return join_decisions((plan_some(world, some, generator, steps) for some in chunks), len(state))
+        return join_decisions((plan_chunk(world, chunk, generator, steps) for chunk in chunks), len(state))
 
     def _plan_together(self, world: World, state: Tensor, generator: torch.Generator, steps: int) -> Decision:
         """In a deterministic world: all prefixes of a depth take their last step together."""
@@ -62,7 +62,7 @@ class ExhaustivePlanner(Planner):
         now, rewards = state, torch.zeros(batch, 0, device=state.device)
         legal = torch.ones(batch, dtype=torch.bool, device=state.device)
         # For each depth at which a plan may end: scores, states and, unless all plans are legal, which ones are.
-        found = []
+        ends_by_depth = []
         for depth in range(1, self.depth + 1):
             if not world.all_legal:
                 legal = (legal[:, None] & allowed_actions(world, now)).flatten()
@@ -72,11 +72,11 @@ class ExhaustivePlanner(Planner):
             rewards = torch.cat([before, reward[:, None]], 1)
             if self.any_prefix or depth == self.depth:
                 ends = (self.score(rewards, now), now) if world.all_legal else (self.score(rewards, now), now, legal)
-                found.append([values.view(batch, actions**depth, *values.shape[1:]) for values in ends])
-        score, final_state, *allowed = (torch.cat(values, 1) for values in zip(*found, strict=True))
+                ends_by_depth.append([values.view(batch, actions**depth, *values.shape[1:]) for values in ends])
+        score, final_state, *allowed = (torch.cat(values, 1) for values in zip(*ends_by_depth, strict=True))
         best = random_best(score, generator, *allowed)
         row = torch.arange(batch, device=state.device)
-        depths = torch.arange(self.depth - len(found) + 1, self.depth + 1, device=state.device)
+        depths = torch.arange(self.depth - len(ends_by_depth) + 1, self.depth + 1, device=state.device)
         past = (actions**depths).cumsum(0)
         length = depths[torch.searchsorted(past, best, right=True)]
         # The digits in base A of a plan's number among those of its length are its actions; zeros fill it up.

@@ -78,7 +78,7 @@ class FrontierPlanner(PriorPlanner):
         if world.max_snapshots is not None:  # of a chunk, those of three steps are used in turn
             chunks = state.split(min(len(chunks[0]) or 1, max(world.max_snapshots // (3 * max(widths)), 1)))
         with self._threads_for(max(map(len, chunks)) * max(widths)):
-            return join_decisions((planner._plan(world, some, generator, steps) for some in chunks), len(state))
+            return join_decisions((planner._plan(world, chunk, generator, steps) for chunk in chunks), len(state))
 
     def _widths(self, actions: int) -> list[int]:
         """How many continuations are tried at each step."""
@@ -99,21 +99,21 @@ class FrontierPlanner(PriorPlanner):
             torch.empty(batch, 1, 0, device=state.device),
             state,
         )
-        found = []  # the best plan of each length that a plan may have
+        decisions = []  # the best plan of each length that a plan may have
         for t, width in enumerate(self._widths(world.num_actions)):
             front, row, action = self._extend(world, front, logits, width, generator)
             if self.any_prefix or t + 1 == self.length:
-                found.append(self._best(front, generator))
+                decisions.append(self._best(front, generator))
             if t + 1 < self.length:
                 rewards = as_floats(front.rewards)
                 gained = rewards.double() @ self.discounts(rewards)[:-1].double()
                 front = front.merge(gained if self.objective == "return" else None)
                 logits, hidden = stepper.step_in(world, action, select_rows(hidden, row), front.state)
-        score = torch.stack([decision.score for decision in found], 1)
+        score = torch.stack([decision.score for decision in decisions], 1)
         best = random_best(score, generator)
         row = torch.arange(batch, device=state.device)
         plan, final = (
-            torch.stack([getattr(decision, name) for decision in found], 1)[row, best]
+            torch.stack([getattr(decision, name) for decision in decisions], 1)[row, best]
             for name in ("plan", "final_state")
         )
         candidates = None

@@ -78,7 +78,7 @@ class MCTSPlanner(PriorPlanner):
         if not whole:
             numbers = max(numbers, self._state_size(world, state) // PER_ACTION)
         chunks = self.chunks(state, self.num_plans * self.length * numbers)
-        return join_decisions((planner._plan(whole, world, some, generator) for some in chunks), len(state))
+        return join_decisions((planner._plan(whole, world, chunk, generator) for chunk in chunks), len(state))
 
     @torch.no_grad()
     def _state_size(self, world: World, state: Tensor) -> int:
@@ -96,11 +96,10 @@ class MCTSPlanner(PriorPlanner):
         from neuroprior.planners.compiled_mcts import search_all
 
         if whole and isinstance(world, TabularWorld):
-            *found, steps = search_all(self, world, state, generator)
+            plans, rewards, states, done, steps = search_all(self, world, state, generator)
         else:
             with self._threads_for(len(state)):
-                *found, steps = _Trees(self, world, state, generator).search()
-        plans, rewards, states, done = found
+                plans, rewards, states, done, steps = _Trees(self, world, state, generator).search()
         rollout = Rollout(states[:, :, -1], rewards, states if self.any_prefix else None)
         score, ends = self.score_rollout(rollout)
         allowed = done[..., None] if self.any_prefix else done
@@ -155,10 +154,10 @@ class _Trees:
             is a plan, `[B, N]`; and the simulator steps of the start that took most. Unless any prefix may win, there
             are only the states at the end: `[B, N, 1, ...]`.
         """
-        found = list[tuple[Tensor, ...]]()
-        while len(rows := self.unfinished()) or not found:
-            found.append(self.simulate(rows))
-        plans, rewards, states, done = (torch.stack(parts, 1) for parts in zip(*found, strict=True))
+        simulations = list[tuple[Tensor, ...]]()
+        while len(rows := self.unfinished()) or not simulations:
+            simulations.append(self.simulate(rows))
+        plans, rewards, states, done = (torch.stack(parts, 1) for parts in zip(*simulations, strict=True))
         return plans, rewards, states, done, int((self.steps - self.left).max()) if len(self.left) else 0
 
     def unfinished(self) -> Tensor:
@@ -183,12 +182,12 @@ class _Trees:
         score = (score if score.dim() == 1 else score.amax(1)).double().cpu()
         back_up(self._nodes(), *(x.numpy() for x in (rows, path, plan, score)))
         rows = rows.to(self.device)
-        found = (plan.to(self.device, self.draw.dtype), rewards, kept, torch.ones_like(rows, dtype=torch.bool))
+        simulation = (plan.to(self.device, self.draw.dtype), rewards, kept, torch.ones_like(rows, dtype=torch.bool))
         batch = len(self.size)
         # Where there is no plan, states are those of the starts: values are asked for all.
-        empty = [part.new_zeros(batch, *part.shape[1:]) for part in found]
+        empty = [values.new_zeros(batch, *values.shape[1:]) for values in simulation]
         empty[2] = self.state[:, :1].expand(empty[2].shape[:2] + self.state.shape[2:]).clone()
-        return tuple(whole.index_copy_(0, rows, part) for whole, part in zip(empty, found, strict=True))
+        return tuple(whole.index_copy_(0, rows, values) for whole, values in zip(empty, simulation, strict=True))
 
     def _descend(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Follow PUCT in the trees of `rows [K]` down to an action that was not tried yet.
@@ -205,8 +204,8 @@ class _Trees:
         # As many numbers are drawn as are needed at most, and what is left is given back.
         before, device = self.generator.get_state(), self.generator.device
         draws = torch.rand(plan.numel() * (1 + actions), generator=self.generator, device=device)
-        given = [x.numpy() for x in (draws.cpu(), path, plan, depth, first)]
-        used = descend(self._nodes(), rows.numpy(), self.planner.exploration, *given)
+        arrays = [x.numpy() for x in (draws.cpu(), path, plan, depth, first)]
+        used = descend(self._nodes(), rows.numpy(), self.planner.exploration, *arrays)
         self.generator.set_state(before)
         torch.rand(used, generator=self.generator, device=device)
         return path, plan, depth, draws[(first + torch.arange(len(rows))[:, None]).to(device)]
@@ -234,28 +233,28 @@ class _Trees:
         for t in range(int(depth.min()) if len(rows) else length, length):
             # All of these plans have t actions behind them, so that the states of the prior have one shape.
             fresh = (depth == t).nonzero()[:, 0]
-            own, node = rows[fresh], path[fresh, t]
+            tree, node = rows[fresh], path[fresh, t]
             if len(going):
                 plan[going, t] = self.draw.actions(logits, uniform[going.to(device), t]).cpu()
             if len(fresh):
-                kept = self.kept.take(t, self.place[own, node])
+                kept = self.kept.take(t, self.place[tree, node])
                 hidden = join_rows(hidden, kept) if len(going) else kept
-            now = torch.cat([now, self.state[own.to(device), node.to(device)]])
+            now = torch.cat([now, self.state[tree.to(device), node.to(device)]])
             going = torch.cat([going, fresh])
             action, place = plan[going, t].to(device), going.to(device)
             now, gained = step_alive(self.world, now, action, self.generator)
             self.reward, rewards = self.reward.to(gained.dtype), rewards.to(gained.dtype)
             rewards[place, t], states[place, t] = gained, now
             self.left[rows[going]] -= 1
-            new, old = self.size[own], len(going) - len(fresh)
-            self.child[own, node, plan[fresh, t]] = new
-            at = own.to(device), new.to(device)
+            new, old = self.size[tree], len(going) - len(fresh)
+            self.child[tree, node, plan[fresh, t]] = new
+            at = tree.to(device), new.to(device)
             self.state[at], self.reward[at] = now[old:], gained[old:]
-            self.size[own] += 1
+            self.size[tree] += 1
             if t + 1 < length:
                 logits, hidden = self.stepper.step_in(self.world, action, hidden, now)
                 logits = self._legal(now, logits)
-                self._keep(own, new, t + 1, logits[old:], select_rows(hidden, slice(old, None)))
+                self._keep(tree, new, t + 1, logits[old:], select_rows(hidden, slice(old, None)))
         return rewards, states
 
     def _legal(self, state: Tensor, logits: Tensor) -> Tensor:

@@ -379,28 +379,28 @@ def decide(
 def join_decisions(parts: Iterable[Decision], batch_size: int) -> Decision:
     """The decisions for chunks of `batch_size` starts as one; its model steps are the most of any chunk."""
     whole, at, steps, kept = None, 0, 0, list[Candidates]()
-    for part in parts:
-        if len(part.plan) == batch_size:
-            return part
+    for decision in parts:
+        if len(decision.plan) == batch_size:
+            return decision
         if whole is None:
             # Allocated once: small results between large temporary blocks would keep memory from being freed.
-            plan, score, final_state = (values.new_empty(batch_size, *values.shape[1:]) for values in part[:3])
-            lengths = None if part.lengths is None else part.lengths.new_empty(batch_size)
+            plan, score, final_state = (values.new_empty(batch_size, *values.shape[1:]) for values in decision[:3])
+            lengths = None if decision.lengths is None else decision.lengths.new_empty(batch_size)
             whole = Decision(plan, score, final_state, 0, lengths)
-        if part.candidates is not None:
-            kept.append(part.candidates)
-        for result, values in zip((*whole[:3], whole.lengths), (*part[:3], part.lengths), strict=True):
+        if decision.candidates is not None:
+            kept.append(decision.candidates)
+        for result, values in zip((*whole[:3], whole.lengths), (*decision[:3], decision.lengths), strict=True):
             if isinstance(result, Tensor) and isinstance(values, Tensor):
-                result[at : at + len(part.plan)] = values
-        at, steps = at + len(part.plan), max(steps, part.model_steps)
+                result[at : at + len(decision.plan)] = values
+        at, steps = at + len(decision.plan), max(steps, decision.model_steps)
     assert whole is not None
     return whole._replace(model_steps=steps, candidates=_join_candidates(kept) if kept else None)
 
 
 def _join_candidates(parts: list[Candidates]) -> Candidates:
     """The candidates for chunks of starts as one; where there are fewer, -inf says that there is no plan."""
-    most = max(part.scores.shape[1] for part in parts)
+    most = max(candidates.scores.shape[1] for candidates in parts)
     pad = torch.nn.functional.pad
-    plans = [pad(part.plans, (0, 0, 0, most - part.plans.shape[1])) for part in parts]
-    scores = [pad(part.scores, (0, most - part.scores.shape[1]), value=-torch.inf) for part in parts]
+    plans = [pad(candidates.plans, (0, 0, 0, most - candidates.plans.shape[1])) for candidates in parts]
+    scores = [pad(candidates.scores, (0, most - candidates.scores.shape[1]), value=-torch.inf) for candidates in parts]
     return Candidates(torch.cat(plans), torch.cat(scores))

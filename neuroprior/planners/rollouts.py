@@ -52,8 +52,8 @@ def mean_scores(
     seed = draw_seed(generator)
     scores, ends = [], []
     for at in range(0, num_plans, at_once):
-        some = plans[:, at : at + at_once]
-        many = some[:, None].expand(-1, num_rollouts, -1, -1).reshape(-1, *some.shape[1:])
+        chunk = plans[:, at : at + at_once]
+        many = chunk[:, None].expand(-1, num_rollouts, -1, -1).reshape(-1, *chunk.shape[1:])
         # The same seed each time, so that all plans get the same random numbers.
         again = torch.Generator(generator.device).manual_seed(seed)
         score, end = planner.score_rollout(world.rollout(repeated, many, again, planner.any_prefix))

@@ -86,16 +86,16 @@ class SamplingPlanner(PriorPlanner):
                 check_in_world(prior, world, state)
         steps, (num_plans, num_rollouts), wins = self.model_steps(world), self.effort(world), list[Tensor]()
 
-        def plan_some(some: Tensor) -> Decision:
-            plans, score, ends = self.candidates(world, some, generator)
+        def plan_chunk(chunk: Tensor) -> Decision:
+            plans, score, ends = self.candidates(world, chunk, generator)
             if self.sources is not None:
                 wins.append(wins_of(score, self.sources.counts(world, num_plans)))
             decision = decide(plans, score, ends, steps, generator, keep=self.keep_candidates)
             if not world.stochastic or plans.shape[1] == 1:
                 return decision
-            return score_anew(self, world, some, decision, num_rollouts, generator)
+            return score_anew(self, world, chunk, decision, num_rollouts, generator)
 
-        decision = join_decisions(map(plan_some, self.chunks(state, steps)), len(state))
+        decision = join_decisions(map(plan_chunk, self.chunks(state, steps)), len(state))
         if self.sources is not None:
             self.sources.learn(world, torch.stack(wins).sum(0))
         return decision
@@ -107,12 +107,12 @@ class SamplingPlanner(PriorPlanner):
         state's own dimensions behind these. With halving, only the plans of the last round are returned.
         """
         drawn = [
-            self._drawn(prior, number, temperature, world, state, generator)
+            self._draw(prior, number, temperature, world, state, generator)
             for prior, number, temperature in self._proposals(world)
             if number
         ]
         if not world.stochastic:
-            scored = [self._scored(plans, rollout, world, state, generator) for plans, rollout in drawn]
+            scored = [self._score(plans, rollout, world, state, generator) for plans, rollout in drawn]
             plans, score, ends = (
                 column[0] if len(column) == 1 else torch.cat(column, 1) for column in zip(*scored, strict=True)
             )
@@ -147,7 +147,7 @@ class SamplingPlanner(PriorPlanner):
             proposals.append((UniformPrior(world.num_actions).to(Stepper(self.prior).device), uniform, 1.0))
         return proposals
 
-    def _drawn(
+    def _draw(
         self, prior: Steppable, number: int, temperature: float, world: World, state: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, Rollout | None]:
         """Plans `[B, number, L]`, and their rollout where they were drawn together with the world."""
@@ -165,7 +165,7 @@ class SamplingPlanner(PriorPlanner):
             keep_states=self.any_prefix and not world.stochastic,
         )
 
-    def _scored(
+    def _score(
         self, plans: Tensor, rollout: Rollout | None, world: World, state: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The plans, their scores and final states in a deterministic world."""
@@ -198,7 +198,7 @@ def wins_of(score: Tensor, counts: list[int]) -> Tensor:
     """
     score = score if score.dim() == 2 else score.amax(2)
     best = (score == score.amax(1, keepdim=True)).double()
-    parts = torch.stack([part.sum(1) for part in best.split(counts, 1)], 1) / best.sum(1, keepdim=True)
+    parts = torch.stack([source.sum(1) for source in best.split(counts, 1)], 1) / best.sum(1, keepdim=True)
     return parts.masked_fill(best.all(1, keepdim=True), 1 / len(counts)).sum(0)
 
 

@@ -116,24 +116,24 @@ def best_sampling(
         how: dict[str, Any] = {"num_rollouts": num_rollouts, "temperature": temperature, "uniform_share": share}
         return SamplingPlanner(prior, length, number, **how, **goal)
 
-    own = {(who, heat): planner(who, num_plans, heat) for who, heat in product(proposers(prior), temperatures)}
+    planners = {(who, heat): planner(who, num_plans, heat) for who, heat in product(proposers(prior), temperatures)}
     uniform = max(uniform_plans(share, num_plans) for share in uniform_shares)
     even = planner(UniformPrior(world.num_actions), uniform) if uniform else None
-    totals = {(*which, share): 0.0 for which, share in product(own, uniform_shares)}
-    steps = next(iter(own.values())).model_steps(world)
-    for some in planner(prior, num_plans).chunks(state, steps):
-        others = None if even is None else even.candidates(world, some, generator)[:2]
-        for which, planning in own.items():
-            drawn = planning.candidates(world, some, generator)[:2]
+    totals = {(*which, share): 0.0 for which, share in product(planners, uniform_shares)}
+    steps = next(iter(planners.values())).model_steps(world)
+    for chunk in planner(prior, num_plans).chunks(state, steps):
+        others = None if even is None else even.candidates(world, chunk, generator)[:2]
+        for which, planning in planners.items():
+            drawn = planning.candidates(world, chunk, generator)[:2]
             for share in uniform_shares:
-                scores = _decided(planning, world, some, drawn, others, share, generator)
+                scores = _best_scores(planning, world, chunk, drawn, others, share, generator)
                 totals[*which, share] += float(scores.double().sum())
     best = max(totals, key=lambda setting: totals[setting])
     means = {setting: total / len(state) for setting, total in totals.items()}
     return Tuned(planner(best[0], num_plans, *best[1:]), *best, means)
 
 
-def _decided(
+def _best_scores(
     planner: SamplingPlanner,
     world: World,
     state: Tensor,

@@ -40,9 +40,9 @@ def continue_plans(
         logits = legal_logits(world, now, logits)
         action = draw.actions(logits)
         if t < rest.shape[1]:
-            given = rest[:, t].long()
-            may = (t < left) & allowed_actions(world, now).gather(1, given[:, None])[:, 0]
-            action = torch.where(may, given, action)
+            planned = rest[:, t].long()
+            may = (t < left) & allowed_actions(world, now).gather(1, planned[:, None])[:, 0]
+            action = torch.where(may, planned, action)
         now, reward = step_alive(world, now, action, generator)
         for column, values in zip(columns, (action.to(draw.dtype), reward, now), strict=True):
             column.append(values)

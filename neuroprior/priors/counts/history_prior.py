@@ -79,13 +79,15 @@ class HistoryPrior(Prior):
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         self.check_start(batch_size, context)
         node = self.start_node.expand(batch_size)
-        return self._at(node, torch.zeros_like(node) if context is None else context.long())
+        return self._outputs_at(node, torch.zeros_like(node) if context is None else context.long())
 
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         self.check_step(action, context)
         contexts = self.num_contexts or 1
         place = state.div(contexts, rounding_mode="floor") * self.num_actions + action.long()
-        return self._at(self.next_node.view(-1)[place].long(), state % contexts if context is None else context.long())
+        return self._outputs_at(
+            self.next_node.view(-1)[place].long(), state % contexts if context is None else context.long()
+        )
 
     def draw_plans(
         self, state: Tensor, counts: Tensor, length: int, temperature: float, generator: torch.Generator
@@ -104,7 +106,7 @@ class HistoryPrior(Prior):
         room = min(LARGEST, max(drawn // 4, states * actions)) // states
         while actions ** (2 * run) <= min(RUNS, room) and 2 * run <= 8 // dtype.itemsize and run < length:
             run *= 2
-        logits, _ = self._at(every.div(contexts, rounding_mode="floor"), every % contexts)
+        logits, _ = self._outputs_at(every.div(contexts, rounding_mode="floor"), every % contexts)
         single = (logits.double() / temperature).softmax(-1)
         if not single.isfinite().all():
             return None  # which is refused when plans are stepped
@@ -117,10 +119,10 @@ class HistoryPrior(Prior):
         plans = np.empty((total, -(-length // run)), tables.actions.dtype)
         ends, start, seed = counts.cumsum(0).numpy(), state.numpy(), draw_seed(generator)
 
-        def part(first: int) -> None:
+        def draw_chunk(first: int) -> None:
             compiled_draws.draw(tables, start, ends, seed, first, plans[first : first + compiled_draws.PLANS])
 
-        share(part, range(0, total, compiled_draws.PLANS))
+        share(draw_chunk, range(0, total, compiled_draws.PLANS))
         return torch.from_numpy(plans.view(runs.dtype))[:, :length].contiguous()
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
@@ -143,14 +145,14 @@ class HistoryPrior(Prior):
         self.check_plans(plans)
         plans = plans.to(self.device)
         size = max(self.actions_at_once // max(plans.max_length, 1), 1)
-        found = [torch.zeros(0, dtype=torch.long, device=self.device)]
+        entries = [torch.zeros(0, dtype=torch.long, device=self.device)]
         for at in range(0, len(plans), size):
-            part = plans[at : at + size]
-            actions, mask = part.actions.long(), part.mask()
+            chunk = plans[at : at + size]
+            actions, mask = chunk.actions.long(), chunk.mask()
             if self.end is not None:
                 mask[:, 1:] &= actions[:, :-1] != self.end
-            found.append((self._places(actions, part.context)[0] * self.num_actions + actions)[mask])
-        return torch.cat(found)
+            entries.append((self._places(actions, chunk.context)[0] * self.num_actions + actions)[mask])
+        return torch.cat(entries)
 
     def _nodes(self, actions: Tensor) -> Tensor:
         """The node before each action of `actions [N, L]`."""
@@ -216,7 +218,7 @@ class HistoryPrior(Prior):
         for name, value in zip(_TABLES, values, strict=True):
             self.register_buffer(name, value.to(self.device))
 
-    def _at(self, node: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
+    def _outputs_at(self, node: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
         """The logits and the state at `node [N]` in `context [N]`."""
         contexts = self.num_contexts or 1
         return self.log_probs[self._row(node, context)], node * contexts + context
