@@ -122,9 +122,9 @@ class BestFirstPlanner(Planner):
         The plan of a start that is not solved leads to the node with the highest sum of rewards and, among these, the
         lowest heuristic: the first such. `model_steps` are the most of any start.
         """
-        found = self.search(world, state)
-        steps = int(found.model_steps.max()) if len(state) else 0
-        return Decision(found.plan, found.score, found.final_state, steps, found.lengths)
+        result = self.search(world, state)
+        steps = int(result.model_steps.max()) if len(state) else 0
+        return Decision(result.plan, result.score, result.final_state, steps, result.lengths)
 
     @torch.no_grad()
     def search(self, world: World, state: Tensor) -> Search:
@@ -155,9 +155,9 @@ class BestFirstPlanner(Planner):
         if self.order is not None and bounded and can_search(world, prior):
             assert isinstance(world, PuzzleWorld)
             return self._search_compiled(world, prior, self.order, state)
-        parts = [self._search(world, prior, some) for some in self.chunks(state, self.max_nodes)]
-        longest = max(part.plan.shape[1] for part in parts)
-        plans = [torch.nn.functional.pad(part.plan, (0, longest - part.plan.shape[1])) for part in parts]
+        parts = [self._search(world, prior, chunk) for chunk in self.chunks(state, self.max_nodes)]
+        longest = max(result.plan.shape[1] for result in parts)
+        plans = [torch.nn.functional.pad(result.plan, (0, longest - result.plan.shape[1])) for result in parts]
         joined = [torch.cat(values) for values in zip(*parts, strict=True) if values[0] is not parts[0].plan]
         return Search(joined[0], torch.cat(plans), *joined[1:])
 
@@ -341,21 +341,21 @@ class _Trees:
         self.size[tree] += 1
         if bool((self.size > self.capacity).any()):
             self._grow()
-        own = torch.log_softmax(logits.double() / self.planner.temperature, -1)
-        check_possible(~own[:, 0].isnan().any())
+        log_probs = torch.log_softmax(logits.double() / self.planner.temperature, -1)
+        check_possible(~log_probs[:, 0].isnan().any())
         legal = self.world.legal_actions(state) & ~self.world.terminated(state)[:, None]
-        left, of_children = self._left(tree, state, legal)
+        left, of_children = self._estimates(tree, state, legal)
         if self.lower_bound is not None:
             bound = value_of(self.lower_bound, state, "lower_bound").double()
             rooted = bound < path["least"]
             path |= {name: path[name].masked_fill(rooted, 0) for name in ("since", "log_prob")}
             path["least"] = path["least"].minimum(bound)
             left = bound if self.planner.heuristic is None else left
-        named = {"left": left, "state": state, "place": place, "action_log_prob": own}
+        named = {"left": left, "state": state, "place": place, "action_log_prob": log_probs}
         for name, values in (path | named).items():
             self.nodes[name][tree, at] = values
-        depth = (path["since"] + 1)[:, None].expand_as(own)
-        cost = self.planner.cost(depth, path["log_prob"][:, None] + own, of_children)
+        depth = (path["since"] + 1)[:, None].expand_as(log_probs)
+        cost = self.planner.cost(depth, path["log_prob"][:, None] + log_probs, of_children)
         cost = cost.masked_fill(~legal | cost.isnan(), inf)
         edges = at[:, None] * self.actions + torch.arange(self.actions, device=at.device)
         self.queue[tree[:, None], edges] = cost
@@ -363,7 +363,7 @@ class _Trees:
         flat = (tree[:, None] * self.minima.shape[1] + block).flatten()
         self.minima.view(-1).scatter_reduce_(0, flat, cost.flatten(), "amin")
 
-    def _left(self, tree: Tensor, state: Tensor, legal: Tensor) -> tuple[Tensor, Tensor]:
+    def _estimates(self, tree: Tensor, state: Tensor, legal: Tensor) -> tuple[Tensor, Tensor]:
         """What the heuristic says of nodes `[M]`, and of their children `[M, A]`; 0 without one."""
         heuristic, children = self.planner.heuristic, torch.zeros_like(legal, dtype=torch.float64)
         if heuristic is None:
@@ -393,17 +393,17 @@ class _Trees:
 
     def _finish(self, tree: Tensor, path: dict[str, Tensor], state: Tensor) -> None:
         """Take the solutions of trees `[M]`."""
-        row, found = self.rows[tree], self.result
-        found.solved[row] = True
+        row, result = self.rows[tree], self.result
+        result.solved[row] = True
         entered = torch.arange(self.capacity, device=tree.device) < self.size[tree][:, None]
         roots = ((self.nodes["since"][tree] == 0) & entered).sum(1)
-        found.log_bound[row] = roots.double().log() + path["peak"]
+        result.log_bound[row] = roots.double().log() + path["peak"]
         self._take(tree, path["edge"], path["depth"], path["gain"], state)
 
     def _take(self, tree: Tensor, edge: Tensor, depth: Tensor, gain: Tensor, state: Tensor) -> None:
         """Write the paths `[M]` that end with `edge` to the results."""
-        row, found = self.rows[tree], self.result
-        found.lengths[row], found.score[row], found.final_state[row] = depth, gain, state
+        row, result = self.rows[tree], self.result
+        result.lengths[row], result.score[row], result.final_state[row] = depth, gain, state
         longest = int(depth.max()) if len(depth) else 0
         plan, now = torch.zeros(len(tree), longest, dtype=torch.long, device=tree.device), edge
         for back in range(1, longest + 1):

@@ -159,12 +159,12 @@ def bootstrap(
             planner = teacher if with_teacher else LevinPlanner(prior, budget, heuristic=heuristic)
             assert planner is not None
             begin = time.perf_counter()
-            found = planner.search(world, problems[:tried])
-            run.take(found)
+            result = planner.search(world, problems[:tried])
+            run.take(result)
             searched = time.perf_counter()
             actions = run.learn(max_actions, settings)
             seconds = searched - begin, time.perf_counter() - searched
-            share, mean = float(found.solved.double().mean()), float(found.expansions.double().mean())
+            share, mean = float(result.solved.double().mean()), float(result.expansions.double().mean())
             run.end(Sweep(len(run.done) + 1, tried, planner.max_nodes, share, len(run.plans), mean, actions, *seconds))
             yield run.done[-1]
         if not run.plans:
@@ -203,9 +203,9 @@ class _Bootstrap:
     def next(self) -> tuple[int, int]:
         """How many problems the next sweep tries, and its budget."""
         tried, budget = min(self.asked["first"], len(self.problems)), self.asked["max_nodes"]
-        known = 0
+        before = 0
         for sweep in self.done:
-            gained, known = sweep.solutions - known, sweep.solutions
+            gained, before = sweep.solutions - before, sweep.solutions
             more = sweep.solved >= ENOUGH and tried < len(self.problems)
             if more:
                 tried = min(MORE * tried, len(self.problems))
@@ -213,10 +213,10 @@ class _Bootstrap:
                 budget *= 2
         return tried, budget
 
-    def take(self, found: Search) -> None:
+    def take(self, result: Search) -> None:
         """Keep the solutions of a search."""
-        for number in found.solved.nonzero()[:, 0].tolist():
-            self.plans[number] = found.plan[number, : int(found.lengths[number])].cpu()
+        for number in result.solved.nonzero()[:, 0].tolist():
+            self.plans[number] = result.plan[number, : int(result.lengths[number])].cpu()
 
     def learn(self, max_actions: int, settings: dict[str, Any]) -> int:
         """Fit the prior to the solutions and, in puzzles, to their reflections and rotations.
@@ -280,12 +280,16 @@ def _read_sweeps(folder: Path) -> dict[str, Any]:
     path = folder / "sweeps.json"
     kept = read_json(path)
     try:
-        found = {"asked": kept["asked"], "generator": kept["generator"], "sweeps": [Sweep(**s) for s in kept["sweeps"]]}
+        content = {
+            "asked": kept["asked"],
+            "generator": kept["generator"],
+            "sweeps": [Sweep(**s) for s in kept["sweeps"]],
+        }
     except (KeyError, TypeError):
-        found = {"sweeps": []}
-    if not found["sweeps"]:
+        content = {"sweeps": []}
+    if not content["sweeps"]:
         raise ValueError(f"{path}: it must hold sweeps, got a damaged file. Give another folder.")
-    return found
+    return content
 
 
 def read_solutions(folder: str | PathLike[str], sweep: int | None = None) -> dict[int, Tensor]:

@@ -170,7 +170,7 @@ def search(
     boards, movers = np.empty((room, num), dtype=np.uint8), np.empty(room, dtype=np.int32)
     hashes, misplaced_in = np.empty(room, np.uint64), np.empty(room, dtype=np.int32)
     came, depths = np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int32)
-    log_probs, own = np.empty(room, dtype=np.float64), np.empty((room, actions), dtype=np.float64)
+    log_probs, action_log_probs = np.empty(room, dtype=np.float64), np.empty((room, actions), dtype=np.float64)
     sinces, peaks, leasts = np.empty(room, dtype=np.int32), np.empty(room), np.empty(room)  # see `best_first._Trees`
     places = 1
     while places < 2 * room:
@@ -204,23 +204,23 @@ def search(
                 for changed in (before, mover):
                     misplaced += cells[changed] != rules.goal[changed]
                     misplaced -= boards[parent, changed] != rules.goal[changed]
-            depth, log_prob = depths[parent] + 1, log_probs[parent] + own[parent, action]
+            depth, log_prob = depths[parent] + 1, log_probs[parent] + action_log_probs[parent, action]
             since, lowest = sinces[parent] + 1, leasts[parent]
             peak = max(peaks[parent], np.log(since + 1.0) - log_prob)
         at = (code * np.uint64(MIXER) >> np.uint64(20)) & mask
-        known = False
+        in_table = False
         while seen[at] >= 0:
             other = seen[at]
             if hashes[other] == code and movers[other] == mover:
-                known = True
+                in_table = True
                 for cell in range(num):
                     if boards[other, cell] != cells[cell]:
-                        known = False
+                        in_table = False
                         break
-                if known:
+                if in_table:
                     break
             at = (at + np.uint64(1)) & mask
-        if known:
+        if in_table:
             continue
         if misplaced == 0:
             return nodes, _path(came, edge, depth, path), np.log(max(roots, 1)) + peak, steps
@@ -240,9 +240,9 @@ def search(
         if patterned:
             write_patterns(rules, cells, mover, padded, rows, codes)
             last = edge % actions if edge >= 0 else actions
-            _log_probs(tables, codes, last, places_of, there, own[node])
+            _log_probs(tables, codes, last, places_of, there, action_log_probs[node])
         else:
-            own[node] = -np.log(float(actions))
+            action_log_probs[node] = -np.log(float(actions))
         for action in range(actions):
             if not can_move(rules, cells, mover, action):
                 continue
@@ -254,7 +254,7 @@ def search(
                 left = steps_left(rules, child, distances, best)
             if order == LEVIN:
                 d = since + 2.0
-                cost = np.log(d + left) - (1 + left / d) * (log_prob + own[node, action])
+                cost = np.log(d + left) - (1 + left / d) * (log_prob + action_log_probs[node, action])
             elif weight == np.inf:
                 cost = left
             else:

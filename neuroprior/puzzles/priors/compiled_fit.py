@@ -35,10 +35,10 @@ def frequent(patterns: Array, min_count: int) -> Array:
     codes, counts = np.full(size, -1, dtype=np.int64), np.zeros(size, dtype=np.int32)
     used = 0
     for at in range(0, len(patterns), 4096):
-        some = patterns[at : at + 4096]
-        while (used + some.size) * 4 > len(codes) * 3:  # room for all that could be new
+        chunk = patterns[at : at + 4096]
+        while (used + chunk.size) * 4 > len(codes) * 3:  # room for all that could be new
             codes, counts = _larger(codes, counts)
-        used += _count(codes, counts, some)
+        used += _count(codes, counts, chunk)
     return np.sort(codes[counts >= min_count]).astype(np.int32)
 
 
@@ -51,13 +51,13 @@ def number_patterns(vocabulary: Array, patterns: Array) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _count(codes: Array, counts: Array, part: Array) -> int:
+def _count(codes: Array, counts: Array, patterns: Array) -> int:
     new = 0
-    for i in range(part.shape[0]):
-        for j in range(part.shape[1]):
-            at = place(codes, part[i, j])
+    for i in range(patterns.shape[0]):
+        for j in range(patterns.shape[1]):
+            at = place(codes, patterns[i, j])
             if codes[at] == -1:
-                codes[at] = part[i, j]
+                codes[at] = patterns[i, j]
                 new += 1
             counts[at] += 1
     return new

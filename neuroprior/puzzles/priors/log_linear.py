@@ -163,8 +163,8 @@ class LogLinearPrior(Prior):
         patterns, last, action, plan = (values.cpu().numpy() for values in steps)
         vocabulary = frequent(patterns, self.min_count)
         rows = number_patterns(vocabulary, patterns)
-        known = self.rows(torch.from_numpy(vocabulary).to(self.device))
-        weights = torch.cat([self.weights[known], torch.zeros_like(self.weights[:1])]).cpu().numpy()
+        old_rows = self.rows(torch.from_numpy(vocabulary).to(self.device))
+        weights = torch.cat([self.weights[old_rows], torch.zeros_like(self.weights[:1])]).cpu().numpy()
         after = self.after.cpu().numpy().copy()
         squares = np.full_like(weights, ADAGRAD), np.full_like(after, ADAGRAD)
         counts, losses = np.ones(len(action), np.float32), np.zeros(len(action))
@@ -200,7 +200,7 @@ class LogLinearPrior(Prior):
             got = "none" if patterns is None else f"{patterns.dtype} {list(patterns.shape)}"
             raise ValueError(f"`context` must be {self.num_patterns} patterns of each state, integers, got {got}.")
         parts = patterns.split(max(AT_ONCE // patterns.shape[1], 1))
-        return torch.cat([self.weights[self.rows(some.to(torch.int32))].sum(1) for some in parts])
+        return torch.cat([self.weights[self.rows(chunk.to(torch.int32))].sum(1) for chunk in parts])
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         self.check_start(batch_size, context)
@@ -222,10 +222,10 @@ class LogLinearPrior(Prior):
 
     def tables_fit(self) -> bool:
         """Whether the tables are those of a prior of this kind; checks what was read from a file."""
-        known, actions = len(self.patterns), self.num_actions
+        vocabulary_size, actions = len(self.patterns), self.num_actions
         return (
-            self.patterns.shape == (known,)
-            and self.weights.shape == (known + 1, actions)
+            self.patterns.shape == (vocabulary_size,)
+            and self.weights.shape == (vocabulary_size + 1, actions)
             and self.after.shape == (actions + 1, actions)
             and bool((self.patterns.diff() > 0).all())
         )

@@ -277,8 +277,8 @@ def observe_boards(rules: Rules, boards: Array, codes: Array) -> None:
     """Write the patterns of each of `boards [N, cells]` to `codes` int32 `[N, F]`."""
     cells = np.empty(boards.shape[1], dtype=np.uint8)
     padded, rows = pattern_room(rules, len(cells))
-    own = np.empty(codes.shape[1], dtype=np.int64)
+    board_codes = np.empty(codes.shape[1], dtype=np.int64)
     for n in range(len(boards)):
         mover = read_board(rules, boards[n], cells)
-        write_patterns(rules, cells, mover, padded, rows, own)
-        codes[n] = own
+        write_patterns(rules, cells, mover, padded, rows, board_codes)
+        codes[n] = board_codes

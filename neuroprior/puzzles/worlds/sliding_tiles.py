@@ -155,17 +155,17 @@ def sliding_tiles(
     check_count("scramble", scramble)
     if shape is not None:
         shape = board_shape(shape)
-    given = None
+    starts = None
     if boards is not None:
         is_file = isinstance(boards, str | Path)
-        given = board_tensor("boards", read_tiles(boards, shape) if is_file else boards)
-        if shape is not None and given.dim() == 2 and given.shape[1] == shape[0] * shape[1]:
-            given = given.view(-1, *shape)
-        if given.dim() != 3 or 0 in given.shape or (shape is not None and given.shape[1:] != shape):
+        starts = board_tensor("boards", read_tiles(boards, shape) if is_file else boards)
+        if shape is not None and starts.dim() == 2 and starts.shape[1] == shape[0] * shape[1]:
+            starts = starts.view(-1, *shape)
+        if starts.dim() != 3 or 0 in starts.shape or (shape is not None and starts.shape[1:] != shape):
             wanted = "[n, H, W], or [n, H * W] with shape=(H, W)" if shape is None else f"[n, {shape[0]}, {shape[1]}]"
-            raise ValueError(f"`boards` must have the shape {wanted}, got {list(given.shape)}.")
-        _check_permutations("boards", given)
-        given, shape = given.to(torch.uint8), (given.shape[1], given.shape[2])
+            raise ValueError(f"`boards` must have the shape {wanted}, got {list(starts.shape)}.")
+        _check_permutations("boards", starts)
+        starts, shape = starts.to(torch.uint8), (starts.shape[1], starts.shape[2])
     if goal is None and shape is None:
         raise ValueError("`sliding_tiles` must be given boards, shape or goal, got none of them.")
     goal = board_tensor("goal", torch.arange(shape[0] * shape[1]).view(shape) if goal is None and shape else goal)
@@ -175,8 +175,8 @@ def sliding_tiles(
     if not 2 <= goal.numel() <= MOST_TILES:
         raise ValueError(f"`goal` must be a board of 2 to {MOST_TILES} cells, got {goal.numel()}.")
     _check_permutations("goal", goal[None])
-    goal = goal.to(torch.uint8) if given is None else goal.to(given.device, torch.uint8)
-    return SlidingTilesWorld(given, goal, tile_windows(*goal.shape) if windows is None else windows, scramble)
+    goal = goal.to(torch.uint8) if starts is None else goal.to(starts.device, torch.uint8)
+    return SlidingTilesWorld(starts, goal, tile_windows(*goal.shape) if windows is None else windows, scramble)
 
 
 def _check_permutations(name: str, boards: Tensor) -> None:
