@@ -113,8 +113,9 @@ class Agent:
         if learn_every is not None and learn_every % plan_length:
             raise ValueError(f"`learn_every` must be a multiple of plan_length = {plan_length}, got {learn_every}")
         check_actions(prior, world)
-        own, chooses = getattr(planner, "prior", None), isinstance(prior, CombinedPrior) and prior.given is None
-        if chooses and own is not prior and any(own is e for e in prior.modules()):
+        planner_prior = getattr(planner, "prior", None)
+        chooses = isinstance(prior, CombinedPrior) and prior.given is None
+        if chooses and planner_prior is not prior and any(planner_prior is e for e in prior.modules()):
             raise ValueError(
                 "`planner` must sample from the prior itself, got one that samples from an expert, in whose place"
                 " the prior fits others when it learns"

@@ -91,11 +91,11 @@ def restore_agent(agent: Agent, folder: str | os.PathLike[str]) -> Agent:
     """
     folder = Path(folder)
     document, data, prior = _read_files(folder, agent.prior.device)
-    own, saved = _settings(agent), document["agent"]
+    settings, saved = _settings(agent), document["agent"]
     saved = saved | {"training": saved.get("training") or {}}  # was None for some priors
-    saved = saved | {"config": _as_described_now(saved["config"], own["config"])}
-    if saved != own:
-        other = [name for name, value in own.items() if saved.get(name) != value]
+    saved = saved | {"config": _as_described_now(saved["config"], settings["config"])}
+    if saved != settings:
+        other = [name for name, value in settings.items() if saved.get(name) != value]
         raise ValueError(f"{folder}: of an agent with other {', '.join(other)}; give this one the same")
     path = folder / document["weights"]
     try:
@@ -132,37 +132,39 @@ def _read_files(folder: Path, device: torch.device) -> tuple[dict[str, Any], byt
         return _read_files(folder, device)
 
 
-def _as_described_now(saved: Any, own: Any) -> Any:
-    """The config of a prior that had not learned, as `own` has it: networks had sizes, which `fit` would change."""
-    if isinstance(saved, list) and isinstance(own, list) and len(saved) == len(own):
-        return [_as_described_now(*both) for both in zip(saved, own, strict=True)]
-    if not isinstance(saved, dict) or not isinstance(own, dict):
+def _as_described_now(saved: Any, current: Any) -> Any:
+    """The config of a prior that had not learned, as `current` has it: networks had sizes, which `fit` would change."""
+    if isinstance(saved, list) and isinstance(current, list) and len(saved) == len(current):
+        return [_as_described_now(*both) for both in zip(saved, current, strict=True)]
+    if not isinstance(saved, dict) or not isinstance(current, dict):
         return saved
-    chosen = {name: value for name, value in own.items() if name == "seed" or value is None}
-    same = {name: _as_described_now(value, own[name]) if name in own else value for name, value in saved.items()}
-    return same | chosen if "seed" in own and "seed" not in saved else same
+    chosen = {name: value for name, value in current.items() if name == "seed" or value is None}
+    same = {
+        name: _as_described_now(value, current[name]) if name in current else value for name, value in saved.items()
+    }
+    return same | chosen if "seed" in current and "seed" not in saved else same
 
 
 def _settings(agent: Agent) -> dict[str, Any]:
     """What determines an agent's run, besides world and planner; as read back from JSON."""
     names = ("replan_every", "warm_start", "num_rollouts", "learn_every", "plan_length", "min_score", "training")
-    found = {name: getattr(agent, name) for name in names} | {"retention": agent.replay.retention}
-    found |= {"agents": list(agent.state.shape), "planner": type(agent.planner).__name__}
-    found |= {"prior": type(agent.prior).__name__, "config": agent.made}
-    settings = json.loads(json.dumps(found, default=str))
+    values = {name: getattr(agent, name) for name in names} | {"retention": agent.replay.retention}
+    values |= {"agents": list(agent.state.shape), "planner": type(agent.planner).__name__}
+    values |= {"prior": type(agent.prior).__name__, "config": agent.made}
+    settings = json.loads(json.dumps(values, default=str))
     assert isinstance(settings, dict)
     return settings
 
 
 def _tensors(agent: Agent) -> dict[str, Tensor]:
     """All tensors except the prior's."""
-    found = {"state": agent.state, "generator": agent.generator.get_state()}
+    tensors = {"state": agent.state, "generator": agent.generator.get_state()}
     if agent.last is not None:
-        found |= {"last.plan": agent.last.plan}
-        found |= {} if agent.last.lengths is None else {"last.lengths": agent.last.lengths}
+        tensors |= {"last.plan": agent.last.plan}
+        tensors |= {} if agent.last.lengths is None else {"last.lengths": agent.last.lengths}
     for k, steps in enumerate(agent.recent):
-        found |= {f"recent.{k}.{name}": values for name, values in steps._asdict().items()}
-    return found | {f"replay.{name}": value for name, value in agent.replay.tensors().items()}
+        tensors |= {f"recent.{k}.{name}": values for name, values in steps._asdict().items()}
+    return tensors | {f"replay.{name}": value for name, value in agent.replay.tensors().items()}
 
 
 def _take(agent: Agent, tensors: dict[str, Tensor], num_recent: int) -> None:

@@ -69,12 +69,12 @@ class Replay:
         if before.context is not None and plans.context is not None:
             context = torch.cat([before.context, plans.context])
         actions = torch.cat([before.actions, plans.actions])
-        known = before.action_names if plans.action_names is None else plans.action_names
-        self.plans = Plans(actions, plans.num_actions, lengths, known, context)
+        action_names = before.action_names if plans.action_names is None else plans.action_names
+        self.plans = Plans(actions, plans.num_actions, lengths, action_names, context)
 
     def tensors(self) -> dict[str, Tensor]:
         """The stored plans as tensors by name, for files."""
         if self.plans is None:
             return {}
-        found = {"actions": self.plans.actions, "lengths": self.plans.lengths, "context": self.plans.context}
-        return {name: value for name, value in found.items() if value is not None}
+        tensors = {"actions": self.plans.actions, "lengths": self.plans.lengths, "context": self.plans.context}
+        return {name: value for name, value in tensors.items() if value is not None}
