@@ -126,7 +126,7 @@ def vector_plans_from_trajectories(
     taken, observed = [], []
     for number, trajectory in enumerate(trajectories):
         place = f"trajectory {number}"
-        actions, made = parts_of(trajectory, place)
+        actions, seen = parts_of(trajectory, place)
         vectors = array_of(actions, f"{place}: actions")
         if not vectors.size:
             vectors = np.zeros((0, low.size), np.float32)
@@ -137,7 +137,7 @@ def vector_plans_from_trajectories(
             )
         taken.append(vectors.astype(np.float32))
         if observations is not None:
-            features = None if made is None else observations_of(made, len(vectors), place)
+            features = None if seen is None else observations_of(seen, len(vectors), place)
             if features is not None and features.ndim == 1:
                 raise ValueError(f"{place}: `observations` must be arrays of features, got integers")
             observed.append(features)

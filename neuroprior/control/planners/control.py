@@ -81,7 +81,7 @@ def control(
     rewards = torch.zeros(batch, num_steps, device=state.device)
     states = state[:, None].repeat(1, num_steps + 1, *[1] * (state.dim() - 1))
     model_steps = torch.zeros(batch, dtype=torch.long, device=state.device)
-    going = ~_ended(world, state)
+    going = ~_end_mask(world, state)
     # Runs that terminated are left out, so that nothing is planned or simulated for them.
     running, now = going.nonzero()[:, 0], state[going]
     lengths, plan = torch.zeros_like(model_steps), actions[:0]
@@ -103,7 +103,7 @@ def control(
         states[running, t + 1] = now
         lengths[running] += 1
         memory = memory.moved_on(action[:, None], observation[:, None], planner.keep)
-        going = ~_ended(world, now)
+        going = ~_end_mask(world, now)
         if not going.all():
             states[running[~going], t + 1 :] = now[~going][:, None]
             running, now, plan, memory = running[going], now[going], plan[going], memory.rows(going)
@@ -119,7 +119,7 @@ def control(
     return Control(plans, rewards, states, model_steps, seconds)
 
 
-def _ended(world: ContinuousWorld, state: Tensor) -> Tensor:
+def _end_mask(world: ContinuousWorld, state: Tensor) -> Tensor:
     """`world.terminated(state)`, checked: integers would be taken for the numbers of runs."""
     ended = world.terminated(state)
     if not isinstance(ended, Tensor) or ended.dtype != torch.bool or ended.shape != state.shape[:1]:

@@ -113,7 +113,7 @@ class ICEMPlanner(VectorPlanner):
         middle, half = middle_and_half(world, state.device)
         mean = fill_plan(memory.mean, len(state), self.length, middle, repeat=True)
         std = first = (self.std * half).expand_as(mean)
-        shifted = self._shifted(memory.elites, mean, std, generator)
+        shifted = self._extend_elites(memory.elites, mean, std, generator)
         # An iteration draws at least one candidate.
         again = [min(shifted.shape[1], self.populations[0] - 1)] + [0] * (len(self.populations) - 1)
         drawn = [size - old for size, old in zip(self.populations, again, strict=True)]
@@ -149,7 +149,7 @@ class ICEMPlanner(VectorPlanner):
         kept = memory._replace(mean=mean, elites=elites[:, : self.num_kept], wins=shares.wins)
         return VectorDecision(best, best_score, self.num_plans * self.length, kept)
 
-    def _shifted(self, elites: Tensor | None, mean: Tensor, std: Tensor, generator: torch.Generator) -> Tensor:
+    def _extend_elites(self, elites: Tensor | None, mean: Tensor, std: Tensor, generator: torch.Generator) -> Tensor:
         """The elites of the decision before, `[B, E, M, D]`, as candidates `[B, E, L, D]`: filled up with noise."""
         if elites is None or not elites.shape[1]:
             return mean[:, None][:, :0]

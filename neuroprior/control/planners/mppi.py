@@ -90,8 +90,8 @@ class MPPIPlanner(VectorPlanner):
         shares = self.shares([self.num_plans], memory, generator)
         (proposed,) = self.proposals(shares, world, state, memory, generator)
         noise = coloured_noise((len(state), shares.most[0][0], *mean.shape[1:]), self.noise_beta, generator)
-        own = mean[:, None] + self.std * half * noise
-        plans = shares.mixed(0, own, self.around(mean, proposed)).clamp(low, high)
+        candidates = mean[:, None] + self.std * half * noise
+        plans = shares.mixed(0, candidates, self.around(mean, proposed)).clamp(low, high)
         score = self.scores(world, state, plans, generator)
         shares.observe(score)
         logits = self._logits(score)

@@ -127,8 +127,9 @@ def _adapted_share(share: float, even: float, wins: Tensor) -> Tensor:
     """The share `[B]` after `wins`; so many candidates of each kind that win as often as all do are counted besides."""
     won, number = wins.unbind(-1)
     mean = won.sum(1, keepdim=True) / number.sum(1, keepdim=True)
-    prior, own = ((won + even * mean) / (number + even)).log().unbind(1)
-    ratio = torch.where(mean[:, 0] > 0, prior - own, 0).clamp(log(MIN_ODDS_RATIO), 0)  # nobody won: nothing is known
+    prior_rate, own_rate = ((won + even * mean) / (number + even)).log().unbind(1)
+    # Where nobody won, nothing is known.
+    ratio = torch.where(mean[:, 0] > 0, prior_rate - own_rate, 0).clamp(log(MIN_ODDS_RATIO), 0)
     return torch.where(ratio < 0, (torch.tensor(share, device=wins.device).logit() + ratio).sigmoid(), share)
 
 
@@ -136,8 +137,8 @@ def _fixed_counts(share: float, ends: Sequence[int]) -> list[int]:
     """How many candidates of each iteration are the prior's, of so many that are drawn up to its end."""
     total = ends[-1] if ends else 0
     wanted = round(share * total)
-    own = int(0 < share < 1 and total > 1)
-    wanted = min(max(wanted, own), total - own)
-    left = own if ends and ends[0] > 1 else 0
+    least = int(0 < share < 1 and total > 1)
+    wanted = min(max(wanted, least), total - least)
+    left = least if ends and ends[0] > 1 else 0
     up_to = [min(ceil(wanted * end / max(total, 1)), end - left) for end in ends]
     return [after - before for before, after in pairwise([0, *up_to])]

@@ -54,7 +54,7 @@ class Memory(NamedTuple):
 
     def rows(self, index: Tensor) -> "Memory":
         """That of the runs at `index` (integers, or a bool mask)."""
-        return Memory._make(None if part is None else part[index] for part in self)
+        return Memory._make(None if values is None else values[index] for values in self)
 
 
 class VectorDecision(NamedTuple):

@@ -84,8 +84,8 @@ class AutoregressivePrior(LinearGaussianPrior):
             scores |= {(order, *each): 0.0 for each in tried}
             for learning, held_out, skip in parts:
                 weight = int(held_out.mask()[:, skip:].sum()) / total
-                found = self.mean_nats_of(tried, self._moments(learning, order), held_out, skip)
-                for each, nats in found.items():
+                mean_nats = self.mean_nats_of(tried, self._moments(learning, order), held_out, skip)
+                for each, nats in mean_nats.items():
                     scores[order, *each] += weight * nats
         order, share, ridge = max(scores, key=scores.__getitem__)  # of equals the first
         self.set_window(self._moments(plans, order)((share, ridge)))
@@ -94,7 +94,7 @@ class AutoregressivePrior(LinearGaussianPrior):
         """Makes the Gaussian of windows of `plans` for a share of `SHARES` and a ridge."""
         windows, values = self.scaled(plans.windows(order + 1)), self.scaled(plans.actions)[plans.mask()]
         mean, covariance, _ = moments_or_white(windows, values, order)
-        return lambda setting: WindowMoments(mean, self._apart(covariance, setting[0]), setting[1])
+        return lambda setting: WindowMoments(mean, self._shrink_shared(covariance, setting[0]), setting[1])
 
     def _parts(self, plans: VectorPlans, generator: torch.Generator) -> list[tuple[VectorPlans, VectorPlans, int]]:
         """Plans to learn from, plans to choose on, and how many vectors of these are only read.
@@ -113,11 +113,11 @@ class AutoregressivePrior(LinearGaussianPrior):
             return [(*held_out_split(plans, generator), 0)]
         if 2 * longest > total:
             at = [round(longest * k / NUM_FOLDS) for k in range(NUM_FOLDS + 1)]
-            return [self._without(ungrouped(plans), *each) for each in pairwise(at) if each[0] < each[1]]
-        found = folds(plans, min(num_units(plans), NUM_FOLDS), draw_seed(generator))
-        return [(plans[learned], plans[left_out], 0) for learned, left_out in found]
+            return [self._hold_out(ungrouped(plans), *each) for each in pairwise(at) if each[0] < each[1]]
+        splits = folds(plans, min(num_units(plans), NUM_FOLDS), draw_seed(generator))
+        return [(plans[learned], plans[left_out], 0) for learned, left_out in splits]
 
-    def _without(self, plans: VectorPlans, first: int, end: int) -> tuple[VectorPlans, VectorPlans, int]:
+    def _hold_out(self, plans: VectorPlans, first: int, end: int) -> tuple[VectorPlans, VectorPlans, int]:
         """The plans without a part of the longest, this part behind the vectors before it, and how many these are."""
         lengths = plans.mask().sum(1)
         row, longest = int(lengths.argmax()), int(lengths.max())
@@ -125,10 +125,10 @@ class AutoregressivePrior(LinearGaussianPrior):
         lengths[row] = first
         both = torch.cat([lengths, lengths.new_tensor([longest - end])])
         learning = VectorPlans(torch.cat([plans.actions, behind]), plans.action_low, plans.action_high, both)
-        known = min(first, max(self.orders) if self.order is None else self.order)
-        return learning[both > 0], plans[row : row + 1].steps(first - known, end), known
+        num_before = min(first, max(self.orders) if self.order is None else self.order)
+        return learning[both > 0], plans[row : row + 1].steps(first - num_before, end), num_before
 
-    def _apart(self, covariance: Tensor, share: float) -> Tensor:
+    def _shrink_shared(self, covariance: Tensor, share: float) -> Tensor:
         """The covariance of windows with that share of what different dimensions have in common taken away."""
         dimension = torch.arange(len(covariance), device=covariance.device) % self.action_size
         return torch.where(dimension[:, None] == dimension, covariance, (1 - share) * covariance)

@@ -11,16 +11,16 @@ from neuroprior.priors.neural.compiled_gru import BLOCK, Network, advance
 Array = np.ndarray[Any, Any]
 
 
-def draw_linear(prior: Any, vectors: Tensor, known: int, noise: Tensor) -> None:
-    """Fill in `vectors [N, known + L, D]`, scaled, behind the first `known`, by standard normal `noise [N, L, D]`."""
+def draw_linear(prior: Any, vectors: Tensor, num_past: int, noise: Tensor) -> None:
+    """Fill scaled `vectors [N, num_past + L, D]` behind the first `num_past` by standard normal `noise [N, L, D]`."""
     weights, offset, std, coupling = (each.numpy() for each in (prior.weights, prior.offset, prior.std, prior.coupling))
-    _linear(vectors.numpy(), known, prior.memory, weights, offset, std, coupling, noise.numpy())
+    _linear(vectors.numpy(), num_past, prior.memory, weights, offset, std, coupling, noise.numpy())
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 def _linear(
     vectors: Array,
-    known: int,
+    num_past: int,
     depth: int,
     weights: Array,
     offset: Array,
@@ -32,7 +32,7 @@ def _linear(
     mean = np.empty(size, np.float32)
     for n in range(len(vectors)):
         plan = vectors[n]
-        for t in range(known, len(plan)):
+        for t in range(num_past, len(plan)):
             h = min(t, depth)
             for d in range(size):
                 mean[d] = offset[h, d]
@@ -43,7 +43,7 @@ def _linear(
                     for d in range(size):
                         mean[d] += value * weights[h, row + j, d]
             for d in range(size):
-                centre = mean[d] + noise[n, t - known, d] * std[h, d]
+                centre = mean[d] + noise[n, t - num_past, d] * std[h, d]
                 for j in range(d):
                     centre += coupling[h, d, j] * (plan[t, j] - mean[j])
                 plan[t, d] = min(max(centre, np.float32(-1)), np.float32(1))
@@ -53,27 +53,27 @@ def draw_recurrent(prior: Any, min_std: float, past: Tensor, uniform: Tensor, no
     """As `VectorGRU.draw`; `min_std` in units of half the range."""
     # numpy throughout: for these sizes a call of torch takes longer than what it computes.
     layers = [[each.detach().numpy() for each in layer] for layer in prior.gru.all_weights]
-    into, own, into_bias, own_bias = (np.stack([layer[i] for layer in layers]) for i in range(4))
+    into, recurrent, into_bias, recurrent_bias = (np.stack([layer[i] for layer in layers]) for i in range(4))
     width = prior.width
     biases = into_bias.copy()
-    biases[:, : 2 * width] += own_bias[:, : 2 * width]
+    biases[:, : 2 * width] += recurrent_bias[:, : 2 * width]
     unused = np.empty((0, 3 * width), np.float32)
     network = Network(
         action=unused,
         past=unused[None],
         beyond=unused,
-        recurrent=np.ascontiguousarray(own.transpose(0, 2, 1)),
-        bias=np.ascontiguousarray(own_bias[:, 2 * width :]),
+        recurrent=np.ascontiguousarray(recurrent.transpose(0, 2, 1)),
+        bias=np.ascontiguousarray(recurrent_bias[:, 2 * width :]),
         above=np.ascontiguousarray(into[1:].transpose(0, 2, 1)),
         above_bias=biases[1:],
         head=np.ascontiguousarray(prior.head.weight.detach().numpy().T),
         head_bias=prior.head.bias.detach().numpy(),
     )
     # What the first layer is given is linear in the inputs: two matrices in one.
-    given = prior.inputs.weight.detach().numpy().T @ into[0].T
-    given_bias = into[0] @ prior.inputs.bias.detach().numpy() + biases[0]
-    inputs, skip = past.contiguous().numpy(), past.shape[2] - len(given)
-    gates = inputs[:, :, skip:] @ given + given_bias
+    gate_weights = prior.inputs.weight.detach().numpy().T @ into[0].T
+    gate_bias = into[0] @ prior.inputs.bias.detach().numpy() + biases[0]
+    inputs, skip = past.contiguous().numpy(), past.shape[2] - len(gate_weights)
+    gates = inputs[:, :, skip:] @ gate_weights + gate_bias
     linear, share = prior.autoregression, prior.autoregressive_share
     bounds = np.stack([each.numpy() for each in (prior.middle, prior.half_range, prior.action_low, prior.action_high)])
     vectors = noise.new_empty(noise.shape)
@@ -84,8 +84,8 @@ def draw_recurrent(prior: Any, min_std: float, past: Tensor, uniform: Tensor, no
         np.ascontiguousarray(gates),
         uniform.numpy(),
         noise.numpy(),
-        given,
-        given_bias,
+        gate_weights,
+        gate_bias,
         prior.linear.weight.detach().numpy(),
         prior.first_log_std.detach().numpy(),
         linear.weights.numpy(),
@@ -117,8 +117,8 @@ def _recurrent(
     past_gates: Array,
     uniform: Array,
     noise: Array,
-    given: Array,
-    given_bias: Array,
+    gate_weights: Array,
+    gate_bias: Array,
     direct: Array,
     first_log_std: Array,
     linear_weights: Array,
@@ -139,7 +139,7 @@ def _recurrent(
         last: `[B, E]`: the last input of each past, of which the first `recent` numbers are last vectors.
         past_gates: `[B, T, 3 H]`: what the inputs of the past add to the gates of the first layer, biases included.
         uniform: `[N, L]`, which choose the components, and standard normal `noise [N, L, D]`.
-        given: `[E', 3 H]`: what the last E' numbers of an input add to these gates, and `given_bias [3 H]`.
+        gate_weights: `[E', 3 H]`: what the last E' numbers of an input add to these gates, and `gate_bias [3 H]`.
         direct: `[D, E]`: what an input adds to the means.
         first_log_std: `[D]`.
         linear_weights, linear_offset, linear_std, linear_coupling: the autoregression, see `Autoregression`.
@@ -150,13 +150,13 @@ def _recurrent(
         min_std: the least standard deviation.
     """
     length, size, entry, one = vectors.shape[1], vectors.shape[2], vectors.shape[2] + 1, np.float32(1)
-    batch, outputs, skip = len(last), len(network.head_bias), last.shape[1] - len(given)
+    batch, outputs, skip = len(last), len(network.head_bias), last.shape[1] - len(gate_weights)
     num_layers, width = network.recurrent.shape[:2]
     each = len(vectors) // max(batch, 1)
-    known, first = np.empty((batch, num_layers, width), np.float32), np.empty((batch, outputs), np.float32)
+    past_states, first = np.empty((batch, num_layers, width), np.float32), np.empty((batch, outputs), np.float32)
     states, logits = np.zeros((num_layers, BLOCK, width), np.float32), np.empty((BLOCK, outputs), np.float32)
     gates, product = np.empty((BLOCK, 3 * width), np.float32), np.empty((BLOCK, 3 * width), np.float32)
-    inputs, read = np.empty((BLOCK, last.shape[1]), np.float32), np.empty((BLOCK, len(given)), np.float32)
+    inputs, read = np.empty((BLOCK, last.shape[1]), np.float32), np.empty((BLOCK, len(gate_weights)), np.float32)
     weights, mean = np.empty(num + 1, np.float32), np.empty(size, np.float32)
     final = num if odds > 0 else num - 1
     centre, half, low, high = bounds[0], bounds[1], bounds[2], bounds[3]
@@ -168,14 +168,14 @@ def _recurrent(
             advance(network, rows, states, gates, product, logits)
         for i in range(rows):
             first[begin + i] = logits[i]
-            known[begin + i] = states[:, i]
+            past_states[begin + i] = states[:, i]
     for begin in range(0, len(vectors), BLOCK):
         rows = min(BLOCK, len(vectors) - begin)
         for i in range(rows):
             start = (begin + i) // each
             inputs[i] = last[start]
             logits[i] = first[start]
-            states[:, i] = known[start]
+            states[:, i] = past_states[start]
         for t in range(length):
             if t:
                 for i in range(rows):
@@ -184,12 +184,12 @@ def _recurrent(
                     for d in range(size):
                         inputs[i, recent - entry + d] = (vectors[begin + i, t - 1, d] - centre[d]) / half[d]
                     inputs[i, recent - 1] = one
-                    for j in range(len(given)):
+                    for j in range(len(gate_weights)):
                         read[i, j] = inputs[i, skip + j]
-                np.dot(read[:rows], given, gates[:rows])
+                np.dot(read[:rows], gate_weights, gates[:rows])
                 for i in range(rows):
                     for j in range(3 * width):
-                        gates[i, j] += given_bias[j]
+                        gates[i, j] += gate_bias[j]
                 advance(network, rows, states, gates, product, logits)
             for i in range(rows):
                 n = begin + i

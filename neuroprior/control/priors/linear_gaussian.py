@@ -120,19 +120,19 @@ class LinearGaussianPrior(VectorPrior):
             plans: with at least one vector that counts.
             skip: first vectors of each plan, which are read and do not count.
         """
-        found: dict[Key, float] = {}
+        nats_by_setting: dict[Key, float] = {}
         values, mask = self.scaled(plans.actions), plans.mask()
         mask[:, :skip] = False
         rest = list(settings)
         while rest:
             first = moments(rest[0])
             at_once = max(MAX_NUMBERS_AT_ONCE // max(first.mean.numel() ** 2, values.numel()), 1)
-            some, rest = rest[:at_once], rest[at_once:]
-            tables = predictions([first, *map(moments, some[1:])], self)
+            chunk, rest = rest[:at_once], rest[at_once:]
+            tables = predictions([first, *map(moments, chunk[1:])], self)
             nats = linear_nats(tables, values, self.half_range).masked_fill(~mask, 0)
             means = (nats.double().sum((1, 2)) / mask.sum()).nan_to_num(nan=float("-inf"), neginf=float("-inf"))
-            found |= dict(zip(some, means.tolist(), strict=True))
-        return found
+            nats_by_setting |= dict(zip(chunk, means.tolist(), strict=True))
+        return nats_by_setting
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         return self._forecast(torch.zeros(batch_size, 0, self.action_size, device=self.device))
@@ -162,12 +162,12 @@ class LinearGaussianPrior(VectorPrior):
         if self.device.type != "cpu":
             return super().continuations(num_plans, length, past, context, generator)
         depth, size, batch = self._depth, self.action_size, len(past)
-        known = min(past.shape[1], depth)
-        vectors = torch.empty(batch * num_plans, known + length, size)
-        vectors[:, :known] = self.scaled(past[:, past.shape[1] - known :]).repeat_interleave(num_plans, 0)
+        num_past = min(past.shape[1], depth)
+        vectors = torch.empty(batch * num_plans, num_past + length, size)
+        vectors[:, :num_past] = self.scaled(past[:, past.shape[1] - num_past :]).repeat_interleave(num_plans, 0)
         noise = torch.randn(batch * num_plans, length, size, generator=generator)
-        draw_linear(self, vectors, known, noise)
-        return self.unscaled(vectors[:, known:]).view(batch, num_plans, length, size)
+        draw_linear(self, vectors, num_past, noise)
+        return self.unscaled(vectors[:, num_past:]).view(batch, num_plans, length, size)
 
     def action_log_probs(self, plans: VectorPlans) -> Tensor:
         self.check_plans(plans)
@@ -223,7 +223,7 @@ def predictions(moments: Sequence[WindowMoments], prior: VectorPrior) -> LinearT
         return _predictions(mean, covariance, ridge, error)
     each = mean.unflatten(1, (-1, size)).mT.flatten(0, 1)
     alone = _predictions(each, covariance.flatten(0, 1), ridge.repeat_interleave(size), error.flatten()[:, None])
-    weights, offset, std = (part[..., 0].unflatten(0, (-1, size)).movedim(1, -1) for part in alone[:3])
+    weights, offset, std = (table[..., 0].unflatten(0, (-1, size)).movedim(1, -1) for table in alone[:3])
     return LinearTables(weights.diag_embed().flatten(2, 3), offset, std, torch.zeros_like(std).diag_embed())
 
 
@@ -237,15 +237,15 @@ def _predictions(mean: Tensor, covariance: Tensor, ridge: Tensor, error: Tensor)
     rows = []
     for h in range(memory + 1):
         past = slice((memory - h) * size, memory * size)
-        known, cross, now = covariance[:, past, past], covariance[:, past, last], covariance[:, last, last]
-        level = known.diagonal(dim1=1, dim2=2).mean(1, keepdim=True).nan_to_num() * ridge[:, None]
+        past_covariance, cross, now = covariance[:, past, past], covariance[:, past, last], covariance[:, last, last]
+        level = past_covariance.diagonal(dim1=1, dim2=2).mean(1, keepdim=True).nan_to_num() * ridge[:, None]
         level = level + 1e-3 * least.repeat(1, h)
-        weights = torch.linalg.solve(known + torch.diag_embed(level), cross)
+        weights = torch.linalg.solve(past_covariance + torch.diag_embed(level), cross)
         if h == memory > 0:
             weights = steady(weights)
         # The mean square of what is left, which with a ridge is more than the conditional variance.
         shared = cross.mT @ weights
-        rest = now - shared - shared.mT + weights.mT @ known @ weights
+        rest = now - shared - shared.mT + weights.mT @ past_covariance @ weights
         rest = (rest + rest.mT) / 2
         # Rounding may leave it slightly indefinite.
         lifted = (-torch.linalg.eigvalsh(rest)[:, :1]).clamp(min=0) + least
@@ -331,18 +331,18 @@ def beyond_bounds(windows: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         Their expectations `[M, D]`, of values inside the bounds these values, and the mean of their variances `[D]`.
     """
-    given, last = windows[:, :-1].flatten(1).double(), windows[:, -1].double()
+    past, last = windows[:, :-1].flatten(1).double(), windows[:, -1].double()
     at, side = last.abs() >= 1, last.sign()
     variance = torch.zeros_like(last)
     if float(at.double().mean(0).max()) < MAX_UNCENSORED_SHARE:
         return last, variance[0] * 0
-    given = given - given.mean(0)
-    known = given.T @ given / len(given)
-    known.diagonal().add_(known.diagonal().mean().nan_to_num() * 1e-3 + 1e-9)
-    solved, value = torch.linalg.solve(known, given.T) / len(given), last
+    past = past - past.mean(0)
+    covariance = past.T @ past / len(past)
+    covariance.diagonal().add_(covariance.diagonal().mean().nan_to_num() * 1e-3 + 1e-9)
+    solved, value = torch.linalg.solve(covariance, past.T) / len(past), last
     for _ in range(EM_STEPS):
         before, middle = value, value.mean(0)
-        mean = middle + given @ (solved @ (value - middle))
+        mean = middle + past @ (solved @ (value - middle))
         std = ((value - mean).square() + variance).mean(0).sqrt().clamp(min=MIN_STD)
         away = (1 - side * mean) / std
         rate = (-away.square() / 2 - torch.special.log_ndtr(-away) - log(2 * pi) / 2).exp()
@@ -363,11 +363,11 @@ def moments_or_white(windows: Tensor, values: Tensor, memory: int) -> WindowMome
         mean, covariance, _ = window_moments(values[:, None])
         eye = torch.eye(memory + 1, dtype=torch.double, device=values.device)
         return WindowMoments(mean.repeat(memory + 1), torch.kron(eye, covariance))
-    found = window_moments(windows)
+    moments = window_moments(windows)
     missing = memory + 2 - len(windows)
     if missing <= 0:
-        return found
+        return moments
     white, variances = values.double().mean(0).repeat(memory + 1), values.double().var(0, correction=0)
-    share, apart = missing / (missing + len(windows)), white - found.mean
-    mixed = torch.lerp(found.covariance, variances.repeat(memory + 1).diag(), share)
-    return WindowMoments(torch.lerp(found.mean, white, share), mixed + share * (1 - share) * apart.outer(apart))
+    share, apart = missing / (missing + len(windows)), white - moments.mean
+    mixed = torch.lerp(moments.covariance, variances.repeat(memory + 1).diag(), share)
+    return WindowMoments(torch.lerp(moments.mean, white, share), mixed + share * (1 - share) * apart.outer(apart))

@@ -79,22 +79,22 @@ class Autoregression(nn.Module):
 
     def learn_from(self, chain: AutoregressivePrior) -> None:
         """Take over an autoregression of at most `order` vectors."""
-        size, known = self.offset.shape[1], len(chain.offset) - 1
-        rows = torch.arange(len(self.offset), device=self.offset.device).clamp(max=known)
+        size, order = self.offset.shape[1], len(chain.offset) - 1
+        rows = torch.arange(len(self.offset), device=self.offset.device).clamp(max=order)
         for name in ("offset", "std", "coupling"):
             getattr(self, name).copy_(getattr(chain, name)[rows])
-        weights = chain.weights[rows].unflatten(1, (known, size)).permute(0, 3, 1, 2)
+        weights = chain.weights[rows].unflatten(1, (order, size)).permute(0, 3, 1, 2)
         self.weights.zero_()
-        if known:
-            self.weights.unflatten(2, (-1, size + 1))[:, :, -known:, :size] = weights
+        if order:
+            self.weights.unflatten(2, (-1, size + 1))[:, :, -order:, :size] = weights
 
     def forward(self, recent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Mean and std `[M, D]` and coupling `[M, D, D]` after inputs `[M, order * (D + 1)]`."""
         order, size = len(self.offset) - 1, self.offset.shape[1]
-        known = recent.unflatten(1, (order, size + 1))[..., -1].sum(1).long()
+        num_past = recent.unflatten(1, (order, size + 1))[..., -1].sum(1).long()
         means = (recent @ self.weights.flatten(0, 1).T).unflatten(1, (order + 1, size)) + self.offset
-        mean = means.take_along_dim(known[:, None, None], 1)[:, 0]
-        return mean, self.std[known], self.coupling[known]
+        mean = means.take_along_dim(num_past[:, None, None], 1)[:, 0]
+        return mean, self.std[num_past], self.coupling[num_past]
 
 
 class VectorGRU(VectorPrior):
@@ -207,16 +207,16 @@ class VectorGRU(VectorPrior):
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         none = torch.zeros(batch_size, 1, self.entry_size, device=self.device)
-        return self._after(self._inputs(none, None, None if context is None else context[:, None]))
+        return self._forecast_after(self._inputs(none, None, None if context is None else context[:, None]))
 
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         hidden, last = state.split([state.shape[1] - self.input_size, self.input_size], 1)
         features = last[:, self.recent_size :] if context is None else self.features(context)
         kept = last[:, self.entry_size : self.recent_size]
-        return self._after(torch.cat([kept, self._entries(action), features], 1)[:, None], hidden)
+        return self._forecast_after(torch.cat([kept, self._entries(action), features], 1)[:, None], hidden)
 
     def read(self, past: Tensor, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
-        return self._after(self._inputs_of_past(past, context))
+        return self._forecast_after(self._inputs_of_past(past, context))
 
     def _inputs_of_past(self, past: Tensor, context: Tensor | None) -> Tensor:
         """The inputs `[N, T, E]` that `past` and `context` are read as."""
@@ -251,7 +251,7 @@ class VectorGRU(VectorPrior):
 
     def draw_in_steps(self, inputs: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
         """As `draw`, by the operations of torch, which a GPU runs."""
-        forecast, state = self._after(inputs)
+        forecast, state = self._forecast_after(inputs)
         each = len(noise) // max(len(inputs), 1)
         last = forecast.repeat_interleave(each).drawn(uniform[:, 0], noise[:, 0])
         state = state.repeat_interleave(each, 0)
@@ -263,7 +263,7 @@ class VectorGRU(VectorPrior):
             vectors.append(last)
         return torch.stack(vectors, 1)
 
-    def _after(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
+    def _forecast_after(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         """The distribution after the last of `inputs [N, T, E]`, and the state."""
         out, hidden = self._encode(inputs, hidden)
         return self._forecast(out[:, -1], inputs[:, -1]), torch.cat([hidden, inputs[:, -1]], 1)
@@ -315,8 +315,8 @@ class VectorGRU(VectorPrior):
         for first in range(0, plans.max_length, at_once):
             now = slice(first, first + at_once)
             previous = actions[:, first - 1] if first else None
-            part = None if context is None else context[:, now]
-            nats, state = self.log_probs_from(actions[:, now], part, previous, state)
+            context_chunk = None if context is None else context[:, now]
+            nats, state = self.log_probs_from(actions[:, now], context_chunk, previous, state)
             parts.append(nats)
         return torch.cat(parts, 1).masked_fill(~plans.mask(), 0)
 
@@ -380,7 +380,7 @@ class VectorGRU(VectorPrior):
         from neuroprior.training import Settings, train  # lightning takes seconds to import: only where it is needed
 
         how, first = Settings(**(DEFAULTS | settings)), self.learns_anew
-        known, memory = self.action_names, self.memory
+        action_names, memory = self.action_names, self.memory
         plans = self.training_plans(plans)
         if first:
             self._warn_of_wide_bounds(plans)
@@ -401,7 +401,7 @@ class VectorGRU(VectorPrior):
                     raise ValueError(f"validation: {error}") from error
             check_alike(learning, validation)
         except ValueError:
-            self.action_names, self.memory = known, memory  # what is refused is not learned from
+            self.action_names, self.memory = action_names, memory  # what is refused is not learned from
             raise
         assert isinstance(validation, VectorPlans)  # as the plans that are learned from
         if first:
@@ -458,8 +458,8 @@ class VectorGRU(VectorPrior):
         self.first_log_std.copy_((first / later).log())
         spread = means.std(0, correction=0).clamp(min=MIN_DIVISOR)
         means.copy_((means - means.mean(0)) / spread * share * later + chain.offset[0])
-        own = later * (1 - share**2) ** 0.5 - 2 * MIN_STD
-        stds.copy_(own.clamp(min=MIN_STD).log().expand_as(stds))
+        std = later * (1 - share**2) ** 0.5 - 2 * MIN_STD
+        stds.copy_(std.clamp(min=MIN_STD).log().expand_as(stds))
         self._parts(self.head.weight.T)[1].mul_(later / (2 * FIRST_STD))
         linear = chain.weights[-1].unflatten(1, (-1, self.entry_size)).clone()
         linear[..., -1] = -(linear[..., :-1] @ chain.offset[0])  # vectors that are missing count as the mean

@@ -57,14 +57,14 @@ class NoisePrior(LinearGaussianPrior):
             check_positive(zero=True, exponent=exponent)
         if scale is not None:
             check_positive(scale=scale)
-        self._given = {"exponent": exponent, "scale": scale, "memory": memory}
+        self._arguments = {"exponent": exponent, "scale": scale, "memory": memory}
         self.exponent = exponent or 0.0
         start = torch.zeros(self.action_size), torch.full((self.action_size,), scale or 1.0)
         self.set_window(self._moments(*start, self.exponent))
 
     @property
     def config(self) -> dict[str, Any]:
-        return super().config | self._given
+        return super().config | self._arguments
 
     @property
     def learned(self) -> dict[str, Any]:
@@ -75,7 +75,7 @@ class NoisePrior(LinearGaussianPrior):
         self.exponent = float(learned["exponent"])
 
     def _moments(self, mean: Tensor, scale: Tensor, exponent: float) -> WindowMoments:
-        memory = int(self._given["memory"] or 0) if exponent else 0
+        memory = int(self._arguments["memory"] or 0) if exponent else 0
         lags = torch.arange(memory + 1, dtype=torch.double, device=mean.device)
         frequency = (lags + 1) / (2 * (memory + 1))
         power = frequency**-exponent
@@ -89,10 +89,10 @@ class NoisePrior(LinearGaussianPrior):
         std = covariance.diagonal().sqrt()
         # A constant has the least standard deviation of predictions.
         std = std.masked_fill(is_constant(std, rounding(self, mean)), 0)
-        if self._given["scale"] is not None:
-            mean, std = torch.zeros_like(mean), torch.full_like(std, self._given["scale"])
+        if self._arguments["scale"] is not None:
+            mean, std = torch.zeros_like(mean), torch.full_like(std, self._arguments["scale"])
         moments = partial(self._moments, mean, std)
-        if self._given["exponent"] is None:
+        if self._arguments["exponent"] is None:
             # Windows of `memory` + 1 vectors for coloured noise, of 1 for white.
             white, coloured = self.exponents[:1], self.exponents[1:]
             nats = self.mean_nats_of(white, moments, plans) | self.mean_nats_of(coloured, moments, plans)

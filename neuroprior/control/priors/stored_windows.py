@@ -95,13 +95,12 @@ class StoredWindows(VectorPrior):
 
     @property
     def config(self) -> dict[str, Any]:
-        own = {"match": self.match, "horizon": self.horizon, "max_windows": self.max_windows}
-        return super().config | own
+        return super().config | {"match": self.match, "horizon": self.horizon, "max_windows": self.max_windows}
 
     @property
     def learned(self) -> dict[str, Any]:
-        found = {"bandwidth": self.bandwidth, "noise": self.noise, "num_segments": len(self.segments)}
-        return super().learned | found
+        sizes = {"bandwidth": self.bandwidth, "noise": self.noise, "num_segments": len(self.segments)}
+        return super().learned | sizes
 
     def restore(self, learned: dict[str, Any]) -> None:
         super().restore(learned)
@@ -177,10 +176,10 @@ class StoredWindows(VectorPrior):
 
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         size = self.match * self.action_size
-        known, place = int(state[0, 0]) if len(state) else 0, int(state[0, 1]) if len(state) else 0
+        num_past, place = int(state[0, 0]) if len(state) else 0, int(state[0, 1]) if len(state) else 0
         value = self.scaled(action)
         past = torch.cat([state[:, 2 : 2 + size], value], 1)[:, self.action_size :]
-        head = torch.tensor([min(known + 1, self.match), place + 1], device=self.device).expand(len(state), 2)
+        head = torch.tensor([min(num_past + 1, self.match), place + 1], device=self.device).expand(len(state), 2)
         if place + 1 == self.horizon:
             return self._begin(torch.cat([head, past], 1))
         ones = torch.ones(self.action_size, device=self.device)
@@ -195,24 +194,24 @@ class StoredWindows(VectorPrior):
 
     def _last(self, past: Tensor) -> Tensor:
         """The end of `past [N, T, D]` by which segments are found, scaled: `[N, match * D]`, 0 where there is none."""
-        known = min(past.shape[1], self.match)
-        last = self.scaled(past[:, past.shape[1] - known :])
-        return torch.nn.functional.pad(last, (0, 0, self.match - known, 0)).flatten(1)
+        num_past = min(past.shape[1], self.match)
+        last = self.scaled(past[:, past.shape[1] - num_past :])
+        return torch.nn.functional.pad(last, (0, 0, self.match - num_past, 0)).flatten(1)
 
     def _begin(self, state: Tensor) -> tuple[GaussianForecast, Tensor]:
         """A new segment, after the past in `state [N, 2 + match * D]`."""
-        known = int(state[0, 0]) if len(state) else 0
-        head = torch.tensor([known, 0], device=self.device).expand(len(state), 2)
-        return self._forecast(torch.cat([head, state[:, 2:], self._matches(state[:, 2:], known)], 1), 0)
+        num_past = int(state[0, 0]) if len(state) else 0
+        head = torch.tensor([num_past, 0], device=self.device).expand(len(state), 2)
+        return self._forecast(torch.cat([head, state[:, 2:], self._matches(state[:, 2:], num_past)], 1), 0)
 
-    def _matches(self, past: Tensor, known: int) -> Tensor:
-        """The log-weights `[N, M]` of segments after `past [N, match * D]`, of which the last `known` vectors count."""
-        own, stored = (
+    def _matches(self, past: Tensor, num_past: int) -> Tensor:
+        """The log-weights `[N, M]` of segments after `past [N, match * D]`, whose last `num_past` vectors count."""
+        recent, stored = (
             # From one of the vectors: dimensions that hardly vary would be lost in rounding.
-            ((vectors[:, self.match - known :] - self.segments[0, 0]) / (self.bandwidth * self.extent)).flatten(1)
+            ((vectors[:, self.match - num_past :] - self.segments[0, 0]) / (self.bandwidth * self.extent)).flatten(1)
             for vectors in (past.unflatten(1, (self.match, self.action_size)), self.segments[:, : self.match])
         )
-        distances = own.square().sum(-1)[:, None] + stored.square().sum(-1) - 2 * own @ stored.T
+        distances = recent.square().sum(-1)[:, None] + stored.square().sum(-1) - 2 * recent @ stored.T
         return (-distances / 2).log_softmax(-1)
 
     def _forecast(self, state: Tensor, place: int) -> tuple[GaussianForecast, Tensor]:
@@ -226,8 +225,8 @@ class StoredWindows(VectorPrior):
         self, num_plans: int, length: int, past: Tensor, context: Tensor | None, generator: torch.Generator
     ) -> Tensor:
         """Whole segments at once: which is followed is drawn at its beginning, and not known afterwards."""
-        batch, known, last = len(past), min(past.shape[1], self.match), self._last(past)
-        weights = self._matches(last, known)
+        batch, num_past, last = len(past), min(past.shape[1], self.match), self._last(past)
+        weights = self._matches(last, num_past)
         parts: list[Tensor] = []
         for at in range(0, length, self.horizon):
             times = num_plans if not parts else 1
@@ -239,6 +238,6 @@ class StoredWindows(VectorPrior):
             if at + steps < length:
                 last = last.repeat_interleave(times, 0)
                 last = torch.cat([last, parts[-1].flatten(1)], 1)[:, steps * self.action_size :]
-                known = min(known + steps, self.match)
-                weights = self._matches(last, known)
+                num_past = min(num_past + steps, self.match)
+                weights = self._matches(last, num_past)
         return self.unscaled(torch.cat(parts, 1)).view(batch, num_plans, length, self.action_size)

@@ -381,9 +381,11 @@ class VectorPrior(SavedModule):
         A hundred-thousandth of the range makes no difference.
         """
         for name in ("action_low", "action_high"):
-            own, theirs = getattr(self, name), getattr(other, name).to(self.device)
-            if own.shape != theirs.shape or not bool(((own - theirs).abs() <= 2e-5 * self.half_range).all()):
-                raise ValueError(f"`{name}` of {what} must be that of the prior, {own.tolist()}, got {theirs.tolist()}")
+            bound, theirs = getattr(self, name), getattr(other, name).to(self.device)
+            if bound.shape != theirs.shape or not bool(((bound - theirs).abs() <= 2e-5 * self.half_range).all()):
+                raise ValueError(
+                    f"`{name}` of {what} must be that of the prior, {bound.tolist()}, got {theirs.tolist()}"
+                )
 
     @property
     def learns_anew(self) -> bool:
@@ -400,14 +402,14 @@ class VectorPrior(SavedModule):
         """
         if isinstance(plans, VectorPlans) and not self.takes_context:
             plans = plans.without_context()
-        known = self.action_names
-        self.action_names = None if self.learns_anew else known
+        action_names = self.action_names
+        self.action_names = None if self.learns_anew else action_names
         try:
             self.check_plans(plans)
             if not plans.mask().any():
                 raise ValueError("`plans` must have a vector to learn from, got none")
         except ValueError:
-            self.action_names = known
+            self.action_names = action_names
             raise
         if plans.action_names is not None:
             self.action_names = tuple(map(str, plans.action_names))

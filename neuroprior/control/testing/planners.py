@@ -36,7 +36,7 @@ def check_vector_planner(make: Callable[..., VectorPlanner], seed: int = 0) -> N
         >>> check_vector_planner(ShootingPlanner)
     """
 
-    def made(prior: VectorPrior, share: float, length: int, num_plans: int) -> VectorPlanner:
+    def make_planner(prior: VectorPrior, share: float, length: int, num_plans: int) -> VectorPlanner:
         planner = make(length, num_plans, prior=prior, prior_share=share)
         require(isinstance(planner, VectorPlanner), f"`make` must be a VectorPlanner, got {type(planner).__name__}")
         return planner
@@ -45,31 +45,31 @@ def check_vector_planner(make: Callable[..., VectorPlanner], seed: int = 0) -> N
     prior = _Normal(world.action_low, world.action_high)
     state = world.reset(12, torch.Generator().manual_seed(seed))
     for length, num_plans, share in ((1, 1, 0.0), (3, 2, 0.5), (4, 8, 0.0), (4, 8, 0.5), (5, 33, 1.0)):
-        planner = made(prior, share, length, num_plans)
+        planner = make_planner(prior, share, length, num_plans)
         memory: Memory | None = None
         for _ in range(3):
             first = _check_decision(planner, world, state, memory, seed)
             memory = first.memory.moved_on(first.plan[:, :1], world.observe(state)[:, None], planner.keep)
             _check_rows(memory, state, length)
     wide = _Normal(world.action_low, world.action_high, 3.0)
-    noisy = made(wide, 1.0, 3, 64)
+    noisy = make_planner(wide, 1.0, 3, 64)
     noisy.prior_as = "noise"  # which goes beyond the bounds, and worlds refuse that
     try:
         noisy.plan(world, state)
     except ValueError as error:
         raise AssertionError(f"plan: with the prior's candidates as noise: {error}") from error
-    for planner in (made(prior, 0.0, 3, 64), made(prior, 1.0, 3, 64), noisy):
+    for planner in (make_planner(prior, 0.0, 3, 64), make_planner(prior, 1.0, 3, 64), noisy):
         _check_choice(planner, _check_decision(planner, world, state, None, seed), world, state, seed)
-    none = made(prior, 0.5, 3, 4).plan(world, state[:0], torch.Generator().manual_seed(seed))
+    none = make_planner(prior, 0.5, 3, 4).plan(world, state[:0], torch.Generator().manual_seed(seed))
     require(none.plan.shape == (0, 3, 2), f"plan of no starts: plan {list(none.plan.shape)}, not [0, 3, 2]")
-    _check_starts(made(prior, 0.5, 3, 8), world, state, seed)
-    plain = made(_Normal(world.action_low, world.action_high, 0.1), 0.0, 4, 8)
-    other = made(prior, 0.0, 4, 8)
+    _check_starts(make_planner(prior, 0.5, 3, 8), world, state, seed)
+    plain = make_planner(_Normal(world.action_low, world.action_high, 0.1), 0.0, 4, 8)
+    other = make_planner(prior, 0.0, 4, 8)
     pair = [each.plan(world, state, torch.Generator().manual_seed(seed)) for each in (plain, other)]
     require(pair[0].plan.equal(pair[1].plan), "prior_share: at 0 the plan depends on the prior")
     wrong = _Normal(world.action_low, world.action_high + 1)
     require(
-        raises(partial(made(wrong, 0.5, 3, 8).plan, world, state)),
+        raises(partial(make_planner(wrong, 0.5, 3, 8).plan, world, state)),
         "plan must raise ValueError for a prior with other bounds than the world's",
     )
     broken = _Mass(torch.nan)
@@ -117,7 +117,9 @@ def _check_choice(planner: VectorPlanner, decision: VectorDecision, world: "_Mas
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.rand(len(state), 64, *decision.plan.shape[1:], generator=generator)
     plans = torch.lerp(world.action_low, world.action_high, drawn)
-    reached, chance = (planner.scores(world, state, some, generator).mean() for some in (decision.plan[:, None], plans))
+    reached, chance = (
+        planner.scores(world, state, candidates, generator).mean() for candidates in (decision.plan[:, None], plans)
+    )
     require(bool(reached > chance), f"plan: its score is {reached:.3g} in the mean, that of random plans {chance:.3g}")
 
 
@@ -143,16 +145,16 @@ def _check_starts(planner: VectorPlanner, world: "_Mass", state: Tensor, seed: i
     memories: list[Memory | None] = [None, None]
     for _ in range(3):
         pair = [
-            planner.plan(world, some, torch.Generator().manual_seed(seed), memory)
-            for some, memory in zip((state, beside), memories, strict=True)
+            planner.plan(world, starts, torch.Generator().manual_seed(seed), memory)
+            for starts, memory in zip((state, beside), memories, strict=True)
         ]
         require(
             torch.allclose(pair[0].plan[0], pair[1].plan[0], atol=1e-6),
             "plan: what is decided for a start depends on the other starts",
         )
         memories = [
-            each.memory.moved_on(each.plan[:, :1], world.observe(some)[:, None], planner.keep)
-            for each, some in zip(pair, (state, beside), strict=True)
+            each.memory.moved_on(each.plan[:, :1], world.observe(starts)[:, None], planner.keep)
+            for each, starts in zip(pair, (state, beside), strict=True)
         ]
 
 

@@ -74,13 +74,13 @@ def random_plans(
     return VectorPlans(actions.to(prior.device), prior.action_low, prior.action_high, context=context)
 
 
-def _stepped(prior: VectorPrior, plans: VectorPlans) -> list[tuple[GaussianForecast, Tensor]]:
+def _step_through(prior: VectorPrior, plans: VectorPlans) -> list[tuple[GaussianForecast, Tensor]]:
     """What `start` and `step` return before each vector of plans."""
     context = plans.context
-    found = [prior.start(len(plans), None if context is None else context[:, 0])]
+    outputs = [prior.start(len(plans), None if context is None else context[:, 0])]
     for t in range(1, plans.max_length):
-        found.append(prior.step(plans.actions[:, t - 1], found[-1][1], None if context is None else context[:, t]))
-    return found
+        outputs.append(prior.step(plans.actions[:, t - 1], outputs[-1][1], None if context is None else context[:, t]))
+    return outputs
 
 
 def _check_stepping(prior: VectorPrior, plans: VectorPlans) -> None:
@@ -92,7 +92,7 @@ def _check_stepping(prior: VectorPrior, plans: VectorPlans) -> None:
     require(prior.log_prob(plans).allclose(whole.sum(-1), atol=1e-3), "log_prob is not the sum of action_log_probs")
     order = torch.arange(num - 1, -1, -1, device=plans.actions.device)
     context = plans.context
-    for t, (forecast, state) in enumerate(_stepped(prior, plans)):
+    for t, (forecast, state) in enumerate(_step_through(prior, plans)):
         where = f"plans of length {length}, vector {t}"
         require(isinstance(state, Tensor) and len(state) == num, f"state must be one tensor of {num} rows ({where})")
         nats = forecast.log_prob(plans.actions[:, t])
@@ -114,12 +114,12 @@ def _check_reading(prior: VectorPrior, plans: VectorPlans) -> None:
     context = plans.context
     context = None if context is None else torch.cat([context, context[:, -1:]], 1)
     # One vector more than is read: a prior may know that a shorter past is the beginning of a plan.
-    known = prior.memory + 1
+    num_read = prior.memory + 1
     nats = [
         prior.read(plans.actions[:, -n:], None if context is None else context[:, -n - 1 :])[0].log_prob(
             plans.actions[:, 0]
         )
-        for n in (steps, known)
+        for n in (steps, num_read)
     ]
     require(nats[0].allclose(nats[1], atol=1e-4), "read depends on more vectors than `memory` says")
 
@@ -148,7 +148,7 @@ def densities(forecast: GaussianForecast, rows: int, values: Tensor, weights: Te
 def _check_total(prior: VectorPrior, plans: VectorPlans) -> None:
     """Densities integrate to one, the masses at the bounds included."""
     values, weights = quadrature(prior, 400 if prior.action_size == 1 else 120)
-    for t, (forecast, _) in enumerate(_stepped(prior, plans)):
+    for t, (forecast, _) in enumerate(_step_through(prior, plans)):
         total = densities(forecast, len(plans), values, weights).flatten(1).sum(1)
         worst = float((total - 1).abs().max())
         require(
@@ -166,13 +166,15 @@ def _check_samples(prior: VectorPrior, plans: VectorPlans, num_plans: int, gener
     context = None if plans.context is None else plans.context[:1, 0]
     length = min(plans.max_length, 3)
     past = plans.actions[:1, :2]
-    for known in (past[:, :0], past):
-        sampled = prior.sample(rows, length, context, past=known, generator=generator)
+    for beginning in (past[:, :0], past):
+        sampled = prior.sample(rows, length, context, past=beginning, generator=generator)
         require(sampled.shape == (1, rows, length, prior.action_size), f"sample: {list(sampled.shape)}")
         vectors = sampled[0]
         inside = (vectors >= prior.action_low) & (vectors <= prior.action_high)
         require(bool(inside.all()), "sample: vectors beyond the bounds")
-        forecast, state = prior.read(known, None if context is None else expand_context(context, known.shape[1] + 1))
+        forecast, state = prior.read(
+            beginning, None if context is None else expand_context(context, beginning.shape[1] + 1)
+        )
         if prior.action_size == 2:
             ranks = _marginal_ranks(prior, forecast, vectors[:, 0, 0], generator)
             _check_uniform(ranks, "vector 0, dimension 0")

@@ -119,8 +119,8 @@ class ContinuousWorld(ABC):
     def check_plans(self, plans: Tensor, batch_size: int) -> None:
         """Raise ValueError unless `plans` are vectors `[batch_size, P, L, D]` between the bounds."""
         if not isinstance(plans, Tensor) or plans.dim() != 4 or len(plans) != batch_size:
-            given = list(plans.shape) if isinstance(plans, Tensor) else kind_of(plans)
-            raise ValueError(f"`plans` must have shape [B, P, L, D] with B = {batch_size} starts, got {given}")
+            got = list(plans.shape) if isinstance(plans, Tensor) else kind_of(plans)
+            raise ValueError(f"`plans` must have shape [B, P, L, D] with B = {batch_size} starts, got {got}")
         check_vectors("plans", plans, self.action_low, self.action_high)
 
 
@@ -137,8 +137,8 @@ def check_outcome(state: Tensor, outcome: object) -> tuple[Tensor, Tensor]:
     Raises:
         ValueError: `outcome` is not a state of the same shape and dtype, and a floating point reward `[N]`.
     """
-    if not isinstance(outcome, tuple) or [isinstance(part, Tensor) for part in outcome] != [True, True]:
-        kinds = [kind_of(part) for part in outcome] if isinstance(outcome, tuple) else kind_of(outcome)
+    if not isinstance(outcome, tuple) or [isinstance(value, Tensor) for value in outcome] != [True, True]:
+        kinds = [kind_of(value) for value in outcome] if isinstance(outcome, tuple) else kind_of(outcome)
         raise ValueError(f"`step` must return two tensors, the next state and the reward, got {kinds}")
     after, reward = outcome
     if after.shape != state.shape or after.dtype != state.dtype:
