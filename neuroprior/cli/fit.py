@@ -82,33 +82,33 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("plans", nargs="*", type=str, default=[], help="Files of behaviour or plans, or minari:NAME.")
     parser.add_argument("--config", action=Recipe, help=f"A recipe: a file, or one of {', '.join(recipes())}.")
     parser.add_class_arguments(Settings, as_group=False, skip={"validation"})
-    given = parser.parse_args(_with_classes(arguments))
-    if (folder := given.resume) is not None:
-        if given != parser.parse_args(["--resume", folder]):
+    parsed = parser.parse_args(_with_classes(arguments))
+    if (folder := parsed.resume) is not None:
+        if parsed != parser.parse_args(["--resume", folder]):
             raise ValueError("`resume` must be given alone: a run goes on with its own options.")
         if not (Path(folder) / OPTIONS).is_file():
             raise ValueError(f"`resume` must be the folder of a run, which holds {OPTIONS}, got {folder}.")
         if not (Path(folder) / PLANS).is_file():
             raise ValueError(f"`resume` must be a run that has kept its {PLANS}, got {folder}; give its command again.")
-        given = parser.parse_args(["--config", str(Path(folder) / OPTIONS), "--resume", folder])
-    options, made = parser.dump(given), parser.instantiate(given).as_dict()
-    del made["config"]
-    training = Settings(**{name: made.pop(name) for name in TRAINING})
-    reading = pop_reading(made, ReadOptions)
-    fit(**made, training=training, options=options, reading=reading)
+        parsed = parser.parse_args(["--config", str(Path(folder) / OPTIONS), "--resume", folder])
+    options, values = parser.dump(parsed), parser.instantiate(parsed).as_dict()
+    del values["config"]
+    training = Settings(**{name: values.pop(name) for name in TRAINING})
+    reading = pop_reading(values, ReadOptions)
+    fit(**values, training=training, options=options, reading=reading)
 
 
 def _with_classes(arguments: list[str]) -> list[str]:
     """Return the arguments with names of priors, such as gru, as the classes or functions that make them."""
-    made = [word for one in arguments for word in (one.split("=", 1) if one.startswith("--prior=") else [one])]
-    places = [number for number, before in enumerate(made, 1) if before == "--prior" and number < len(made)]
+    words = [word for one in arguments for word in (one.split("=", 1) if one.startswith("--prior=") else [one])]
+    places = [number for number, before in enumerate(words, 1) if before == "--prior" and number < len(words)]
     for place in places:
-        name = made[place]
+        name = words[place]
         if name.isidentifier() and PRIORS.find(name) is None and SavedModule.known.find(name) is None:
             raise ValueError(f"`prior` must be one of {', '.join(PRIORS)}, or a class, got {name}.")
         if (kind := PRIORS.find(name)) is not None:
-            made[place] = f"{kind.__module__}.{getattr(kind, '__name__', '')}"
-    return made
+            words[place] = f"{kind.__module__}.{getattr(kind, '__name__', '')}"
+    return words
 
 
 def fit(
@@ -191,21 +191,21 @@ def fit(
         parts = divide(ended, validation, held_out, folds, past_durations, seed)
         training = replace(training, validation=validation)
         try:
-            made = make_prior(parts.plans, make, use_context)
+            model = make_prior(parts.plans, make, use_context)
         except TypeError as error:
             raise ValueError(
                 f"`prior` must take what it is given: {error}; --use_context false leaves the context out."
             ) from error
         frames = {}
         if modes is not None:
-            made, frames["modes"] = _choose_modes(made, modes, parts)
+            model, frames["modes"] = _choose_modes(model, modes, parts)
         if orders is not None:
-            made, frames["orders"] = _choose_order(made, orders, parts)
-        if made.fit_settings and torch.cuda.is_available():
-            made.cuda()
-        fresh = deepcopy(made)
-        if isinstance(made, NeuralPrior):
-            made.prepare(parts.learned_from, training.window)
+            model, frames["orders"] = _choose_order(model, orders, parts)
+        if model.fit_settings and torch.cuda.is_available():
+            model.cuda()
+        fresh = deepcopy(model)
+        if isinstance(model, NeuralPrior):
+            model.prepare(parts.learned_from, training.window)
         if resume is None:
             write_whole(folder / OPTIONS, options.encode())  # first: it says whose folder it is
             write_plans(source, folder / PLANS)
@@ -214,22 +214,22 @@ def fit(
             print(f"note: {note}")
         # Defaults are left to the prior, as in `neuroprior.fit`: those of the networks inside it may be others.
         changed = {name: value for name, value in vars(training).items() if value != getattr(DEFAULTS, name)}
-        settings = {name: changed[name] for name in made.fit_settings if name in changed}
+        settings = {name: changed[name] for name in model.fit_settings if name in changed}
         curve: list[dict[str, float]] = []
         try:
-            if isinstance(made, NeuralPrior):
+            if isinstance(model, NeuralPrior):
                 how = replace(training, validation=parts.chosen_on)
-                curve = train(made, parts.learned_from, how, seed, folder)
+                curve = train(model, parts.learned_from, how, seed, folder)
             elif is_learned(folder):
-                made = load(folder)
+                model = load(folder)
             else:
                 learned_from = parts.plans if parts.folds > 1 else parts.learned_from
-                made.fit(learned_from, generator=torch.Generator().manual_seed(seed), **settings)
-            if isinstance(made, CombinedPrior) and isinstance(fresh, CombinedPrior):
-                fresh.networks = made.trained  # those that did not pay are not tried again in each fold
-            if "progress" in made.fit_settings:
+                model.fit(learned_from, generator=torch.Generator().manual_seed(seed), **settings)
+            if isinstance(model, CombinedPrior) and isinstance(fresh, CombinedPrior):
+                fresh.networks = model.trained  # those that did not pay are not tried again in each fold
+            if "progress" in model.fit_settings:
                 settings["progress"] = False  # of several processes, which would get mixed
-            report(folder, made, curve, parts, fresh, settings)
+            report(folder, model, curve, parts, fresh, settings)
         except KeyboardInterrupt as interrupted:
             raise KeyboardInterrupt(f"interrupted; go on with: neuroprior fit --resume {folder}") from interrupted
 
@@ -261,7 +261,7 @@ def _choose_order(prior: Prior, orders: list[int], parts: Parts) -> tuple[Prior,
     if prior.order != 1:
         orders = [prior.order]
     contexts = [prior.num_contexts]
-    plans = [plans_for(prior, part) for part in (parts.learned_from, parts.chosen_on)]
+    plans = [plans_for(prior, subset) for subset in (parts.learned_from, parts.chosen_on)]
     tried = [best_chain(plans[0], order, contexts, plans[1]) for order in sorted(set(orders))]
     best = min(tried, key=lambda one: one.validation_bits)
     if not isinstance(best.prior, MarkovPrior):

@@ -81,8 +81,8 @@ def divide(
         parts = fair_split(rest, share, generator) if len(rest) > 2 else longest_cut(rest, share)
     else:
         parts = fair_split(rest, share, generator)
-    for name, part in (("validation", parts[1]), ("held_out", last)):
-        if (count := int(part.mask().sum())) < MIN_ACTIONS:
+    for name, subset in (("validation", parts[1]), ("held_out", last)):
+        if (count := int(subset.mask().sum())) < MIN_ACTIONS:
             raise ValueError(f"`{name}` must leave at least {MIN_ACTIONS} actions, got {count}; give more plans.")
     num_contexts, past = context_arguments(plans).get("num_contexts"), None
     if past_durations:

@@ -50,15 +50,15 @@ def cross_validated(
     # Counting takes less time than starting processes; and these cannot share a GPU's memory.
     counts = not prior.fit_settings or (isinstance(prior, CombinedPrior) and prior.networks == ())
     alone = counts or prior.device.type != "cpu"
-    found = run.do(range(data.folds), processes=1 if alone else None, title="folds")
+    fold_arrays = run.do(range(data.folds), processes=1 if alone else None, title="folds")
     held_out = [index for _, index in folds(data.plans, data.folds, data.seed)]
     scores = {}
-    for name in [key.removesuffix("/bits") for key in found[0] if key.endswith("/bits")]:
-        if all(f"{name}/bits" in arrays for arrays in found):  # one may be too large for its tables in some folds
+    for name in [key.removesuffix("/bits") for key in fold_arrays[0] if key.endswith("/bits")]:
+        if all(f"{name}/bits" in arrays for arrays in fold_arrays):  # one may be too large for its tables in some folds
             bits = torch.zeros(data.plans.actions.shape, dtype=torch.double)
-            for index, arrays in zip(held_out, found, strict=True):
+            for index, arrays in zip(held_out, fold_arrays, strict=True):
                 bits[index] = torch.from_numpy(arrays[f"{name}/bits"])
-            takes = any(bool(arrays[f"{name}/context"]) for arrays in found)
+            takes = any(bool(arrays[f"{name}/context"]) for arrays in fold_arrays)
             scores[name] = score_bits(name, CONTEXT if takes else ACTIONS, bits, data.plans)
     return scores
 
@@ -69,12 +69,12 @@ def _fit_and_score(fresh: Prior, settings: dict[str, Any], data: Parts, num_cont
     learned, held_out = divisible(data.plans[training]), data.plans[index]
     generator = torch.Generator().manual_seed(data.seed * 1000 + fold)
     prior = deepcopy(fresh).fit(plans_for(fresh, learned), generator=generator, **settings)
-    found = _arrays(TRAINED, prior, held_out)
+    arrays = _arrays(TRAINED, prior, held_out)
     for baseline in baselines(*fair_split(learned, data.validation, generator), num_contexts):
         if baseline.prior is not None:
             # Its settings were chosen on the validation plans; then these are learned from as well.
-            found |= _arrays(baseline.model, baseline.prior.fit(plans_for(baseline.prior, learned)), held_out)
-    return found
+            arrays |= _arrays(baseline.model, baseline.prior.fit(plans_for(baseline.prior, learned)), held_out)
+    return arrays
 
 
 def _arrays(name: str, prior: Prior, held_out: Plans) -> Arrays:

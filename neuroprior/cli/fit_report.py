@@ -77,7 +77,7 @@ def report(
     console.print(_table(frame, best.model, data))
     divided = {"training": data.learned_from, "validation": data.chosen_on, "held_out": data.held_out}
     results = {"rows": records(frame), "chosen": best.model, "unit": unit_name(data.held_out), "folds": data.folds}
-    results |= {"plans": {part: len(plans) for part, plans in divided.items()}, "curve": curve}
+    results |= {"plans": {subset: len(plans) for subset, plans in divided.items()}, "curve": curve}
     write_json(folder / "metrics.json", results | {"versions": versions()})
     write_frames(folder, {"metrics": frame})
     if curve:

@@ -41,8 +41,8 @@ class Command(NamedTuple):
         """Import the function."""
         module, _, name = self.target.partition(":")
         with ending_at_interrupts():
-            found: Callable[..., Any] = getattr(import_module(module), name)
-        return found
+            function: Callable[..., Any] = getattr(import_module(module), name)
+        return function
 
 
 def run_commands(
@@ -60,17 +60,17 @@ def run_commands(
         The exit code.
     """
 
-    def run(given: Sequence[str]) -> None:
-        if not given or given[0] in ("-h", "--help"):
+    def run(words: Sequence[str]) -> None:
+        if not words or words[0] in ("-h", "--help"):
             wide = max(map(len, commands))
             lines = [f"  {name:{wide}}  {command.about}" for name, command in commands.items()]
             print(f"usage: {program} COMMAND ...\n\n{about}\n\ncommands:")
             print("\n".join(lines) + f"\n\n{program} COMMAND --help lists the options of a command.")
             return
-        if given[0] == "--version":
+        if words[0] == "--version":
             print(f"neuroprior {__version__}")
             return
-        name, *options = given
+        name, *options = words
         if name not in commands:
             raise ValueError(f"{name!r} is no command; there are {', '.join(commands)}")
         command = commands[name]
@@ -155,7 +155,7 @@ def _plain(value: Any) -> Any:
 
 def _item_of(hint: Any) -> Any:
     """The type of the items of a list, or of a list that may be None; None for other types."""
-    options = [part for part in get_args(hint) if part is not NoneType]
+    options = [option for option in get_args(hint) if option is not NoneType]
     if get_origin(hint) in (Union, UnionType) and len(options) == 1:
         hint = options[0]
     return get_args(hint)[0] if get_origin(hint) in (list, Sequence) else None
@@ -171,13 +171,13 @@ def run_program(run: Callable[[Sequence[str]], None], arguments: Sequence[str] |
     Returns:
         The exit code.
     """
-    given = sys.argv[1:] if arguments is None else arguments
+    words = sys.argv[1:] if arguments is None else arguments
     main, before = threading.current_thread() is threading.main_thread(), signal.getsignal(signal.SIGTERM)
     if main and before == signal.SIG_DFL:
         # Where time is up, a cluster ends a program by this signal: it says what is saved, as after Ctrl-C.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        run([_with_underscores(argument) for argument in given])
+        run([_with_underscores(argument) for argument in words])
     except KeyboardInterrupt as interrupted:
         # An impatient second Ctrl-C should not spoil the message.
         if main:

@@ -43,14 +43,14 @@ def sample(
         raise ValueError(f"{out}: is there already; give another name")
     prior = load(folder)
     generator = torch.Generator().manual_seed(seed)
-    given = _context(prior, context, folder, num_plans)
+    context_index = _context(prior, context, folder, num_plans)
     plans: Plans
     timed = isinstance(prior, SemiMarkovPrior) and out is not None and Path(out).suffix.lower() in (".npz", ".csv")
     if isinstance(prior, SemiMarkovPrior) and timed:
-        plans = prior.sample_plans(num_plans, length, given, temperature=temperature, generator=generator)
+        plans = prior.sample_plans(num_plans, length, context_index, temperature=temperature, generator=generator)
         plans = plans.without_context()
     else:
-        actions = prior.sample(num_plans, length, given, temperature=temperature, generator=generator)
+        actions = prior.sample(num_plans, length, context_index, temperature=temperature, generator=generator)
         plans = Plans(actions, prior.num_actions, action_names=prior.action_names, end=prior.end)
     if prior.end is not None:
         plans = plans.without_end()
@@ -93,13 +93,13 @@ def _context(prior: Prior, name: str | None, folder: str, num_plans: int) -> Ten
     if prior.num_contexts is None:
         raise ValueError(f"{folder}: it takes features as context; sample it from Python, with Prior.sample")
     names = prior.context_names or ()
-    some = ", ".join(names[:8]) if names else f"0 to {prior.num_contexts - 1}"
+    choices = ", ".join(names[:8]) if names else f"0 to {prior.num_contexts - 1}"
     if name is None:
-        raise ValueError(f"context: the prior in {folder} takes one; give --context and a name or number ({some})")
+        raise ValueError(f"context: the prior in {folder} takes one; give --context and a name or number ({choices})")
     if name in names:
         index = names.index(name)
     elif name.isdecimal() and int(name) < prior.num_contexts and not names:
         index = int(name)
     else:
-        raise ValueError(f"context: {name!r} is not known to the prior in {folder}; it knows {some}")
+        raise ValueError(f"context: {name!r} is not known to the prior in {folder}; it knows {choices}")
     return torch.full((num_plans,), index, dtype=torch.long)

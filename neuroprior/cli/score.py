@@ -44,13 +44,13 @@ def score(
         reading: how files are read.
     """
     prior, place = load(folder), Path(out)
-    known, durations = learned_names(prior), PastDurations.load(Path(folder))
+    action_names, durations = learned_names(prior), PastDurations.load(Path(folder))
 
-    def read(some: list[str]) -> tuple[RecordedPlans, RecordedPlans, list[str]]:
+    def read(paths: list[str]) -> tuple[RecordedPlans, RecordedPlans, list[str]]:
         """The plans of files, the same as the prior numbers them, and notes."""
-        tabular = is_recording(some)
+        tabular = is_recording(paths)
         # Numbers in a table are the prior's own; its names make sure that there are as many.
-        plans = replace(reading, action_names=reading.action_names or (known if tabular else None)).read(some)
+        plans = replace(reading, action_names=reading.action_names or (action_names if tabular else None)).read(paths)
         plans = plans if plans.end is None else plans.without_end()
         plans, notes = with_contexts_of(prior, plans, tabular)
         matched = match_plans(plans, prior, folder)
@@ -88,8 +88,8 @@ def score(
     notes = [*plans.notes, *notes]
     if plans.action_names and reading.action_names is None and prior.action_names is None:
         notes.append(f"{numbered_note('actions', plans.action_names)}; --action_names orders them")
-    if plans.action_names is None and known is not None:
-        notes.append(taken_note("actions", known))
+    if plans.action_names is None and action_names is not None:
+        notes.append(taken_note("actions", action_names))
     console = Console(markup=False, emoji=False)
     for note in notes:
         console.print(f"note: {note}", highlight=False, soft_wrap=True)
@@ -112,7 +112,9 @@ def _on_past(plans: RecordedPlans, before: RecordedPlans) -> list[str]:
     if again := sum(are_among(plans, {*plan_digests(before)}, LONG_ENOUGH)):
         notes.append(f"{again:,} of {len(plans):,} scored plans are in it, too: their bits are too low")
     if plans.group is not None and before.group is not None:
-        here, there = (set(group_names(each, group)) for each, group in ((plans, plans.group), (before, before.group)))
-        if alone := sorted(here - there):
-            notes.append(f"{len(alone)} of {len(here)} subjects are not in it, and scored alone: {listed(alone)}")
+        subjects, past_subjects = (
+            set(group_names(each, group)) for each, group in ((plans, plans.group), (before, before.group))
+        )
+        if alone := sorted(subjects - past_subjects):
+            notes.append(f"{len(alone)} of {len(subjects)} subjects are not in it, and scored alone: {listed(alone)}")
     return notes
