@@ -146,8 +146,8 @@ class AdaptivePrior(Prior):
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         logits = self.base(plans, context)
         out = torch.empty_like(logits)
-        for some, now in _blocks(*plans.shape):
-            out[some, now] = self._adapt(logits[some, now], plans[some].long(), now.start)
+        for rows, now in _blocks(*plans.shape):
+            out[rows, now] = self._adapt(logits[rows, now], plans[rows].long(), now.start)
         return out
 
     def _adapt(self, logits: Tensor, actions: Tensor, first: int) -> Tensor:
@@ -222,8 +222,8 @@ class AdaptivePrior(Prior):
             self.register_buffer(name, getattr(self, name)[:0])
         if self.fit_settings:
             learned, held_out = split_validation(plans, pop_validation(self, settings), generator)
-            known = {"validation": held_out, **settings}
-            self.base.fit(plans_for(self.base, learned), generator=generator, **known)
+            base_settings = {"validation": held_out, **settings}
+            self.base.fit(plans_for(self.base, learned), generator=generator, **base_settings)
             self.learn_concentrations([(self.base, held_out)])
             self.base.recount(plans)
         else:
@@ -247,22 +247,22 @@ class AdaptivePrior(Prior):
         Raises:
             ValueError: plans of other actions or contexts than this prior's.
         """
-        columns = [self._taken(base, known_plans(self, plans)) for base, plans in predicted]
+        columns = [self._action_statistics(base, known_plans(self, plans)) for base, plans in predicted]
         if not columns:
             self.concentrations = (inf,) * len(self.concentrations)
             return
         self.concentrations = likeliest_concentrations(*join_columns(columns))
 
-    def _taken(self, base: Prior, plans: Plans) -> tuple[Tensor, Tensor, Tensor]:
+    def _action_statistics(self, base: Prior, plans: Plans) -> tuple[Tensor, Tensor, Tensor]:
         """Of M actions: the base's probability `[M]`, and its count and their sum at the K levels, `[K, M]` each."""
         parts = []
-        for part, log_probs in base.forecasts(plans):
-            actions, mask, length = part.actions.long(), part.mask(), part.max_length
-            for some, now in _blocks(len(part), length):
-                index, inside = actions[some, now, None], mask[some, now]
+        for chunk, log_probs in base.forecasts(plans):
+            actions, mask, length = chunk.actions.long(), chunk.mask(), chunk.max_length
+            for rows, now in _blocks(len(chunk), length):
+                index, inside = actions[rows, now, None], mask[rows, now]
                 steps = min(now.stop, length) - now.start
-                counted = self._counts(actions[some], now.start, steps, range(len(self.tables)))
-                values = [log_probs[some, now].exp(), *(counts for counts, _ in counted)]
+                counted = self._counts(actions[rows], now.start, steps, range(len(self.tables)))
+                values = [log_probs[rows, now].exp(), *(counts for counts, _ in counted)]
                 taken = [value.gather(-1, index)[inside][:, 0].double() for value in values]
                 totals = [total[inside][:, 0].double() for _, total in counted]
                 parts.append((taken[0], torch.stack(taken[1:]), torch.stack(totals)))
@@ -300,8 +300,8 @@ class AdaptivePrior(Prior):
         actions = torch.full((int(row.max()) + 1, length), -1, device=mask.device)
         logits = base.new_zeros(*actions.shape, self.num_actions)
         actions[at], logits[at] = plans.actions[mask].long(), base[mask]
-        for some, now in _blocks(*actions.shape):
-            logits[some, now] = self._adapt(logits[some, now], actions[some], now.start)
+        for rows, now in _blocks(*actions.shape):
+            logits[rows, now] = self._adapt(logits[rows, now], actions[rows], now.start)
         taken = base.new_zeros(mask.shape)
         taken[mask] = logits[at].log_softmax(-1).gather(-1, plans.actions[mask].long()[:, None])[:, 0]
         return taken
@@ -348,14 +348,14 @@ def adapt(prior: AnyPrior, plans: Plans | Tensor) -> AnyPrior:
     if not isinstance(prior, Prior):
         raise ValueError(f"`prior` must be a fitted prior, got {type(prior).__name__}.")
     adapted = deepcopy(prior)
-    parts = [part for part in adapted.modules() if isinstance(part, AdaptivePrior)]
+    parts = [learner for learner in adapted.modules() if isinstance(learner, AdaptivePrior)]
     if not parts:
         raise ValueError(
             f"`prior` must learn along a sequence, as an `AdaptivePrior` does (`neuroprior fit --prior adaptive`), or a"
             f" combined prior of sequences of a hundred actions or more; this {type(prior).__name__} does not."
         )
-    for part in parts:
-        part.count(plans)
+    for learner in parts:
+        learner.count(plans)
     return adapted
 
 
@@ -394,14 +394,14 @@ def likeliest_concentrations(probs: Tensor, counts: Tensor, totals: Tensor) -> t
             minimize(loss, [log(first)] * len(levels), jac=True, method="L-BFGS-B", bounds=bounds)
             for first in START_CONCENTRATIONS
         ]
-        best = min(tries, key=lambda found: float(found.fun))
+        best = min(tries, key=lambda solution: float(solution.fun))
         return float(best.fun), dict(zip(levels, np.exp(best.x).tolist(), strict=True))
 
     levels = tuple(range(len(counts)))
     least, finite = search(levels)
     while levels:
         fewer = [search(tuple(other for other in levels if other != level)) for level in levels]
-        loss, rest = min(fewer, key=lambda found: found[0])
+        loss, rest = min(fewer, key=lambda outcome: outcome[0])
         if loss - least >= MIN_GAIN_NATS:
             break
         least, finite, levels = loss, rest, tuple(rest)

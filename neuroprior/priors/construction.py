@@ -9,21 +9,21 @@ from neuroprior.priors.prior import Prior
 from neuroprior.priors.saved import SavedModule
 
 
-def as_prior(given: Prior | Mapping[str, Any]) -> Prior:
+def as_prior(prior: Prior | Mapping[str, Any]) -> Prior:
     """A prior that is given, or described as in the `config` of a prior made of priors: `prior` (its class), `config`.
 
     Raises:
         KeyError: the description lacks a key.
         ValueError: it describes no prior that is known.
     """
-    if isinstance(given, Prior):
-        return given
-    if not isinstance(given, Mapping):
-        raise ValueError(f"`prior` must be a prior or its description, got {given!r}")
-    kind = SavedModule.known.find(given["prior"])
+    if isinstance(prior, Prior):
+        return prior
+    if not isinstance(prior, Mapping):
+        raise ValueError(f"`prior` must be a prior or its description, got {prior!r}")
+    kind = SavedModule.known.find(prior["prior"])
     if kind is None or not issubclass(kind, Prior):
-        raise ValueError(f"{given['prior']}: not a prior over numbered actions")
-    return kind(**given["config"])
+        raise ValueError(f"{prior['prior']}: not a prior over numbered actions")
+    return kind(**prior["config"])
 
 
 def described(prior: Prior) -> dict[str, Any]:
@@ -42,17 +42,17 @@ def construct(make: Callable[..., Prior], num_actions: int, contexts: Mapping[st
     """
     parameters = inspect.signature(make).parameters
     takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
-    given = {name for name, value in getattr(make, "keywords", {}).items() if value is not None}
-    wanted = {name: c for name, c in contexts.items() if (takes_any or name in parameters) and name not in given}
+    fixed = {name for name, value in getattr(make, "keywords", {}).items() if value is not None}
+    wanted = {name: c for name, c in contexts.items() if (takes_any or name in parameters) and name not in fixed}
     return make(num_actions, **wanted)
 
 
-def context_arguments(*some: Plans) -> dict[str, int]:
+def context_arguments(*subsets: Plans) -> dict[str, int]:
     """The constructor's arguments for the context of plans: `num_contexts`, `context_size`, `num_patterns` or none.
 
     The number of contexts is that of their names, if these are more than occur.
     """
-    contexts = [plans.context for plans in some if plans.context is not None]
+    contexts = [plans.context for plans in subsets if plans.context is not None]
     if not contexts:
         return {}
     if contexts[0].is_floating_point():
@@ -60,4 +60,4 @@ def context_arguments(*some: Plans) -> dict[str, int]:
     if has_patterns(contexts[0]):
         return {"num_patterns": contexts[0].shape[-1]}
     most = max((int(context.max()) + 1 for context in contexts if context.numel()), default=1)
-    return {"num_contexts": max(most, *(len(plans.context_names or ()) for plans in some))}
+    return {"num_contexts": max(most, *(len(plans.context_names or ()) for plans in subsets))}

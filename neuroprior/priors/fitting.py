@@ -63,9 +63,9 @@ def fit(
             f"`prior` must be a class, a function or a name, got one {type(prior).__name__} that is made already; use"
             " its own fit(plans)"
         )
-    given: object = plans
-    if isinstance(given, Sequences) and not isinstance(given, Plans):
-        raise ValueError(f"`plans` must be Plans of numbered actions, got {type(given).__name__}")
+    argument: object = plans
+    if isinstance(argument, Sequences) and not isinstance(argument, Plans):
+        raise ValueError(f"`plans` must be Plans of numbered actions, got {type(argument).__name__}")
     if not isinstance(plans, Plans):
         actions = as_actions(plans)
         plans = Plans(actions, count_up_to(int(actions.max())) if actions.numel() else 1)
@@ -82,10 +82,12 @@ def fit(
         if prior is not CombinedPrior:
             raise ValueError("effort: for the combined prior alone; leave it out, or leave prior out")
         prior = partial(CombinedPrior, effort=effort)
-    made = make_prior(plans, prior)
-    fitted: object = made.fit(plans, generator=generator, **settings)
+    model = make_prior(plans, prior)
+    fitted: object = model.fit(plans, generator=generator, **settings)
     if not isinstance(fitted, Prior):
-        raise ValueError(f"prior: {type(made).__name__}.fit returned {type(fitted).__name__}; it must return the prior")
+        raise ValueError(
+            f"prior: {type(model).__name__}.fit returned {type(fitted).__name__}; it must return the prior"
+        )
     return fitted
 
 

@@ -85,8 +85,8 @@ def infer(
         >>> posterior.names[posterior.log_probs[0, -1].argmax()]
         'left'
     """
-    named = _named(priors)
-    observed = _observed(plans, context, named)
+    named = _name_priors(priors)
+    observed = _observed_plans(plans, context, named)
     check_share("switch", switch)
     if not is_number(power) or not 0 <= power < inf:
         raise ValueError(f"`power` must be a finite number of at least 0, got {power!r}")
@@ -98,7 +98,7 @@ def infer(
     ]
     mask = observed.mask().cpu()
     log_likelihood = torch.stack(scores, -1)
-    now, found = prior_log, [prior_log]
+    now, posteriors = prior_log, [prior_log]
     for t in range(length):
         before = now
         if switch:
@@ -115,11 +115,11 @@ def infer(
                 " that is still possible; priors that smooth their counts give every action some"
             )
         now = torch.where(mask[:, t, None], joint - total, now)
-        found.append(now)
-    return Posterior(tuple(named), torch.stack(found, 1), observed)
+        posteriors.append(now)
+    return Posterior(tuple(named), torch.stack(posteriors, 1), observed)
 
 
-def _named(priors: Mapping[str, Prior] | Sequence[Prior]) -> dict[str, Prior]:
+def _name_priors(priors: Mapping[str, Prior] | Sequence[Prior]) -> dict[str, Prior]:
     """The priors by name; those of a list have their numbers."""
     if not isinstance(priors, Mapping | Sequence) or not priors:
         raise ValueError("`priors` must have at least one prior for each intention, by name or in a list")
@@ -127,21 +127,21 @@ def _named(priors: Mapping[str, Prior] | Sequence[Prior]) -> dict[str, Prior]:
     for name, prior in named.items():
         if not isinstance(prior, Prior):
             raise ValueError(f"`priors[{name!r}]` must be a fitted prior, got {type(prior).__name__}")
-    known = {name: prior.num_actions - (prior.end is not None) for name, prior in named.items()}
-    if len(set(known.values())) > 1:
-        raise ValueError(f"priors: all must know the same number of actions, not {known}")
+    counts = {name: prior.num_actions - (prior.end is not None) for name, prior in named.items()}
+    if len(set(counts.values())) > 1:
+        raise ValueError(f"priors: all must know the same number of actions, not {counts}")
     return named
 
 
-def _observed(plans: Plans | Tensor, context: Tensor | None, priors: dict[str, Prior]) -> Plans:
+def _observed_plans(plans: Plans | Tensor, context: Tensor | None, priors: dict[str, Prior]) -> Plans:
     """The plans that were observed, without an end symbol."""
     if not isinstance(plans, Plans):
         prior = next(iter(priors.values()))
         # The same numbers are given to all.
         names = {name: learned_names(one) for name, one in priors.items()}
         check_alike_named(names, "give the actions as Plans with names")
-        known = prior.num_actions - (prior.end is not None)
-        return Plans(torch.as_tensor(plans), known, context=context)
+        num_actions = prior.num_actions - (prior.end is not None)
+        return Plans(torch.as_tensor(plans), num_actions, context=context)
     if context is not None:
         raise ValueError("context: Plans have their own; give it with actions [B, L] alone")
     return plans if plans.end is None else plans.without_end()
@@ -149,10 +149,10 @@ def _observed(plans: Plans | Tensor, context: Tensor | None, priors: dict[str, P
 
 def _log_weights(weights: Tensor | Sequence[float] | None, batch: int, number: int) -> Tensor:
     """The logarithms `[B, K]` of the probabilities in advance."""
-    given = torch.ones(number) if weights is None else torch.as_tensor(weights)
-    given = given.double().cpu()
-    if given.shape not in ((number,), (batch, number)):
-        raise ValueError(f"`weights` must have shape [{number}] or [{batch}, {number}], got {list(given.shape)}")
-    if not bool(given.isfinite().all()) or bool((given < 0).any()) or bool((given.sum(-1) <= 0).any()):
+    values = torch.ones(number) if weights is None else torch.as_tensor(weights)
+    values = values.double().cpu()
+    if values.shape not in ((number,), (batch, number)):
+        raise ValueError(f"`weights` must have shape [{number}] or [{batch}, {number}], got {list(values.shape)}")
+    if not bool(values.isfinite().all()) or bool((values < 0).any()) or bool((values.sum(-1) <= 0).any()):
         raise ValueError("`weights` must be finite numbers from 0, with one above 0 in each row")
-    return (given / given.sum(-1, keepdim=True)).log().expand(batch, number)
+    return (values / values.sum(-1, keepdim=True)).log().expand(batch, number)

@@ -35,13 +35,13 @@ def training_plans(prior: Prior, plans: Plans | Tensor, *, further: bool = False
     """
     if isinstance(plans, Plans):
         _warn_of_context(prior, plans)
-    plans = _as_taken(prior, plans)
+    plans = _trimmed_plans(prior, plans)
     check_actions(prior, plans)
-    known = prior.action_names if further else None
-    check_same_names("action_names", known, plans.action_names, "the plans", "this prior, which learns further")
+    action_names = prior.action_names if further else None
+    check_same_names("action_names", action_names, plans.action_names, "the plans", "this prior, which learns further")
     prior.check_context_of(plans)
     prior.end, prior.has_learned = plans.end, True
-    prior.action_names = known if plans.action_names is None else tuple(plans.action_names)
+    prior.action_names = action_names if plans.action_names is None else tuple(plans.action_names)
     prior.context_names = None
     if prior.takes_context:
         prior.context_per = "step" if constant_context(plans) is None else "plan"
@@ -58,7 +58,7 @@ def validation_plans(prior: Prior, plans: Plans | Tensor) -> Plans:
     Raises:
         ValueError: another number of actions, or a context of another kind than the prior takes.
     """
-    plans = _as_taken(prior, plans)
+    plans = _trimmed_plans(prior, plans)
     check_actions(prior, plans)
     prior.check_context_of(plans)
     return plans
@@ -76,7 +76,7 @@ def known_plans(prior: Prior, plans: Plans | Tensor) -> Plans:
     Raises:
         ValueError: another number of actions, other names, a context of another kind, or no action at all.
     """
-    plans = _as_taken(prior, plans)
+    plans = _trimmed_plans(prior, plans)
     prior.check_plans(plans)
     if not bool(plans.mask().any()):
         raise ValueError("`plans` must have at least one plan with an action")
@@ -104,7 +104,7 @@ def plans_for(prior: Prior, plans: AnyPlans) -> AnyPlans:
     return plans if prior.takes_context else plans.without_context()
 
 
-def _as_taken(prior: Prior, plans: Plans | Tensor) -> Plans:
+def _trimmed_plans(prior: Prior, plans: Plans | Tensor) -> Plans:
     """As `plans_for`, as `Plans` on the prior's device, as wide as the longest: padding changes nothing learned."""
     return plans_for(prior, prior.as_plans(plans)).trimmed()
 

@@ -40,10 +40,10 @@ def match_plans(plans: AnyPlans, prior: Prior, name: str = "prior") -> AnyPlans:
                 f" {plans.end} of {plans.num_actions}; give plans.without_end()"
             )
         return plans_for(prior, plans)
-    known = prior.num_actions - (prior.end is not None)
-    if plans.num_actions > known:
-        raise ValueError(f"`{name}` must know at least the {plans.num_actions} actions of the plans, got {known}")
-    plans = renumbered(plans, known, learned_names(prior), prior.context_names, name)
+    num_actions = prior.num_actions - (prior.end is not None)
+    if plans.num_actions > num_actions:
+        raise ValueError(f"`{name}` must know at least the {plans.num_actions} actions of the plans, got {num_actions}")
+    plans = renumbered(plans, num_actions, learned_names(prior), prior.context_names, name)
     plans = plans_for(prior, plans)
     return plans if prior.end is None else plans.with_end()
 
@@ -100,15 +100,15 @@ def renumbered(
     return replace(plans, context=context, context_names=context_names)
 
 
-def numbers(known: Sequence[str], names: Sequence[str], before: str, after: str) -> Tensor:
+def numbers(vocabulary: Sequence[str], names: Sequence[str], before: str, after: str) -> Tensor:
     """The number under which each of the names is known.
 
     Raises:
         ValueError: a name is not known; the message has it between `before` and `after`, and then all known names.
     """
-    if unknown := [name for name in names if name not in known]:
-        raise ValueError(f"{before} {unknown[0]!r}{after} {', '.join(known)}")
-    return torch.tensor([known.index(name) for name in names])
+    if unknown := [name for name in names if name not in vocabulary]:
+        raise ValueError(f"{before} {unknown[0]!r}{after} {', '.join(vocabulary)}")
+    return torch.tensor([vocabulary.index(name) for name in names])
 
 
 def with_contexts_of(prior: Prior, plans: AnyPlans, is_table: bool) -> tuple[AnyPlans, list[str]]:
@@ -119,18 +119,18 @@ def with_contexts_of(prior: Prior, plans: AnyPlans, is_table: bool) -> tuple[Any
         plans: as they were read.
         is_table: whether they were read from a table (CSV), in which names may be numbers.
     """
-    known, names, context = prior.context_names, plans.context_names, plans.context
-    if prior.num_contexts is None or context is None or (known is None) == (names is None):
+    prior_names, names, context = prior.context_names, plans.context_names, plans.context
+    if prior.num_contexts is None or context is None or (prior_names is None) == (names is None):
         return plans, []
-    if known is None:
+    if prior_names is None:
         return plans, [numbered_note("contexts", names or ())]
     occurring = context[plans.mask()].unique()
     names = tuple(map(str, occurring.tolist()))
-    if is_table and names and set(names) <= set(known):
+    if is_table and names and set(names) <= set(prior_names):
         # What stands behind the end of a plan is none of them.
         number = torch.searchsorted(occurring, context).clamp(max=len(names) - 1)
         return replace(plans, context=number, context_names=names), []
-    return plans, [taken_note("contexts", known)]
+    return plans, [taken_note("contexts", prior_names)]
 
 
 def numbered_note(what: str, names: Sequence[str]) -> str:
@@ -139,7 +139,7 @@ def numbered_note(what: str, names: Sequence[str]) -> str:
     return f"the prior knows {what} by number, so the file's were numbered: {order}"
 
 
-def taken_note(what: str, known: Sequence[str]) -> str:
+def taken_note(what: str, names: Sequence[str]) -> str:
     """The note on actions or contexts of which the prior alone has names."""
-    order = listed([f"{number} = {name}" for number, name in enumerate(known)])
+    order = listed([f"{number} = {name}" for number, name in enumerate(names)])
     return f"the {what} are numbers, which are taken for those of the prior's names: {order}"

@@ -263,8 +263,8 @@ class Prior(SavedModule):
             self.check_plans(plans)
             return torch.zeros(plans.actions.shape, device=self.device)
         parts = []
-        for part, log_probs in self.forecasts(plans):
-            taken = log_probs.gather(-1, part.actions.long()[..., None])[..., 0].masked_fill(~part.mask(), 0)
+        for chunk, log_probs in self.forecasts(plans):
+            taken = log_probs.gather(-1, chunk.actions.long()[..., None])[..., 0].masked_fill(~chunk.mask(), 0)
             unknown = taken.isnan()
             if unknown.any():  # which a prior may give after an impossible action
                 possible = (taken == -torch.inf).cumsum(1) == 0
@@ -286,11 +286,11 @@ class Prior(SavedModule):
         plans = plans.to(self.device)
         size = max(self.actions_at_once // max(plans.max_length, 1), 1)
         for at in range(0, len(plans), size):
-            part = plans[at : at + size]
-            logits = self(part.actions, part.context)
+            chunk = plans[at : at + size]
+            logits = self(chunk.actions, chunk.context)
             if self.end is not None:
-                logits = torch.cat([logits[:, :1], after_end(logits[:, 1:], part.actions[:, :-1].long(), self.end)], 1)
-            yield part, torch.log_softmax(logits, -1)
+                logits = torch.cat([logits[:, :1], after_end(logits[:, 1:], chunk.actions[:, :-1].long(), self.end)], 1)
+            yield chunk, torch.log_softmax(logits, -1)
 
     def as_plans(self, plans: Plans | Tensor) -> Plans:
         """`plans` as `Plans`, on this prior's device."""
@@ -389,11 +389,11 @@ class Prior(SavedModule):
 
     def check_settings(self, settings: Mapping[str, Any]) -> None:
         """Raise ValueError unless `fit` takes all of these settings."""
-        known = self.fit_settings
+        accepted = self.fit_settings
         for name in settings:
-            if name not in known:
+            if name not in accepted:
                 raise ValueError(
-                    f"{name}: not a setting of {type(self).__name__}.fit, which takes {', '.join(known) or 'none'}"
+                    f"{name}: not a setting of {type(self).__name__}.fit, which takes {', '.join(accepted) or 'none'}"
                 )
 
 

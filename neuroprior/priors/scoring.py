@@ -119,26 +119,26 @@ def scores_by(bits: Tensor, plans: Plans, by: str, learned: list[bool] | None = 
         names = plans.action_names or tuple(map(str, range(plans.num_actions)))
         data = {"action": plans.actions[mask].tolist(), "plan": mask.nonzero()[:, 0].tolist()}
         frame = pd.DataFrame(data | {"bits": bits[:, : plans.max_length][mask].tolist()}).groupby("action")
-        found = frame.agg(plans=("plan", "nunique"), actions=("plan", "size"), bits=("bits", "sum")).reset_index()
-        found["action"] = [names[action] for action in found["action"]]
+        scores = frame.agg(plans=("plan", "nunique"), actions=("plan", "size"), bits=("bits", "sum")).reset_index()
+        scores["action"] = [names[action] for action in scores["action"]]
     else:
         numbers = {"training_data": learned} if learned is not None else {}
         numbers |= {"actions": mask.sum(1).tolist(), "bits": bits.sum(1).tolist()}
-        found = plan_frame(plans).assign(**numbers)
+        scores = plan_frame(plans).assign(**numbers)
         if by != "plan":
-            sums = found.groupby(by, sort=False, as_index=False)
-            found = sums.agg(plans=("plan", "size"), **{name: (name, "sum") for name in numbers})
-    found["log_likelihood"] = -log(2) * found["bits"]
-    found["bits_per_action"] = found["bits"] / found["actions"].where(found["actions"] > 0)
-    return found.drop(columns="bits")
+            sums = scores.groupby(by, sort=False, as_index=False)
+            scores = sums.agg(plans=("plan", "size"), **{name: (name, "sum") for name in numbers})
+    scores["log_likelihood"] = -log(2) * scores["bits"]
+    scores["bits_per_action"] = scores["bits"] / scores["actions"].where(scores["actions"] > 0)
+    return scores.drop(columns="bits")
 
 
 def plan_frame(plans: Plans) -> Any:
     """A pandas frame with a row a plan: its number `plan`, its `group` and whatever else it has one of, by name."""
     import pandas as pd
 
-    own = {what: _names(plans, what) for what in _units_of(plans) if getattr(plans, what) is not None}
-    return pd.DataFrame({"plan": range(len(plans))} | own)
+    columns = {what: _names(plans, what) for what in _units_of(plans) if getattr(plans, what) is not None}
+    return pd.DataFrame({"plan": range(len(plans))} | columns)
 
 
 def _units_of(plans: Plans) -> list[str]:
@@ -174,7 +174,7 @@ def keep_learned(
         held_out: what it has not learned from.
         plans: those that all this was taken from; of a plan that was cut, and so is in no part, a part was learned.
     """
-    learned = {one for part in parts for one in plan_digests(part)}
+    learned = {one for subset in parts for one in plan_digests(subset)}
     if plans is not None:
         learned |= {*plan_digests(plans)} - {*(() if held_out is None else plan_digests(held_out))}
     model = (folder / MODEL).read_bytes() if model is None else model
@@ -207,14 +207,14 @@ def _read_learned(folder: Path) -> set[str] | None:
     if not place.is_file():
         return None
     content = read_json(place)
-    known = content.get("plans") if isinstance(content, dict) else None
-    if not isinstance(known, list) or not all(isinstance(one, str) for one in known):
+    digests = content.get("plans") if isinstance(content, dict) else None
+    if not isinstance(digests, list) or not all(isinstance(one, str) for one in digests):
         raise ValueError(f"{place}: damaged; it does not say which plans were learned from")
     model = folder / MODEL
-    return set(known) if model.is_file() and digest(model.read_bytes()) == content.get("model") else None
+    return set(digests) if model.is_file() and digest(model.read_bytes()) == content.get("model") else None
 
 
-def are_among(plans: Plans, known: set[str], least: int = 1) -> list[bool]:
+def are_among(plans: Plans, digests: set[str], least: int = 1) -> list[bool]:
     """Which plans, of at least so many actions, are among those with these digests."""
     long = (plans.mask().sum(1) >= least).tolist()
-    return [counts and digest in known for digest, counts in zip(plan_digests(plans), long, strict=True)]
+    return [counts and digest in digests for digest, counts in zip(plan_digests(plans), long, strict=True)]

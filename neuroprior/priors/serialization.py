@@ -82,7 +82,7 @@ def model_bytes(prior: SavedModule) -> bytes:
     try:
         content = json.loads(json.dumps(content, default=operator.index))
         content["sha256"] = _checksum(content)
-        _make(_verified(content), tensors)
+        _make(_verify(content), tensors)
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(
             f"`prior` must be one that can be loaded again, got {type(prior).__name__}: {error}"
@@ -134,7 +134,7 @@ def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu", *, 
     data = (folder / MODEL).read_bytes()
     content, tensors = _in_file(folder / MODEL, lambda: _read(data))
     if (folder / CONFIG).exists():  # not yet there, or that of the model before, while or where a save was cut off
-        _in_file(folder / CONFIG, lambda: _verified(read_json(folder / CONFIG)))
+        _in_file(folder / CONFIG, lambda: _verify(read_json(folder / CONFIG)))
     if not issubclass(_class_of(content), kind):
         name = content["prior"]
         raise ValueError(f"{folder} must hold a {kind.__name__}, got {name}; load(folder, kind={name}) reads it")
@@ -161,7 +161,7 @@ def _read(data: bytes) -> tuple[dict[str, Any], dict[str, Tensor]]:
         content = _content_of(data)
     except (SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"truncated, changed or not the file of a saved prior ({error})") from error
-    if _verified(content)["weights"] != _checksum_of(tensors):
+    if _verify(content)["weights"] != _checksum_of(tensors):
         raise ValueError("its tensors were changed since it was saved")
     return content, tensors
 
@@ -173,11 +173,11 @@ def _content_of(data: bytes) -> Any:
 
 
 def _checksum_of(tensors: Mapping[str, Tensor]) -> str:
-    found = hashlib.sha256()
+    checksum = hashlib.sha256()
     for name, value in sorted(tensors.items()):
-        found.update(f"{name} {value.dtype} {list(value.shape)}\n".encode())
-        found.update(value.numpy().tobytes())
-    return found.hexdigest()
+        checksum.update(f"{name} {value.dtype} {list(value.shape)}\n".encode())
+        checksum.update(value.numpy().tobytes())
+    return checksum.hexdigest()
 
 
 def _checksum(content: Mapping[str, Any]) -> str:
@@ -186,7 +186,7 @@ def _checksum(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()
 
 
-def _verified(content: Any) -> dict[str, Any]:
+def _verify(content: Any) -> dict[str, Any]:
     """The configuration of a saved prior, if it is one, and as it was saved; else ValueError."""
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f'not the configuration of a saved prior ("format": "{FORMAT}" is missing)')
@@ -220,7 +220,7 @@ def _values(value: Any, depth: int = 0) -> Iterator[Any]:
 
 
 def _class_of(content: Mapping[str, Any]) -> type[SavedModule]:
-    """The class that a configuration names, which `_verified` has found to be known."""
+    """The class that a configuration names, which `_verify` has found to be known."""
     kind = SavedModule.known.find(content["prior"])
     assert kind is not None
     return kind
@@ -240,11 +240,13 @@ def _make(content: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> SavedMod
     for entry, value in same.items():
         if value != content[entry]:
             raise ValueError(f"{entry!r} is not what a {name} of this configuration has")
-    own, tables, logs = prior.state_dict(), _names(prior, "tables"), _names(prior, "log_tables")
-    if unknown := sorted(own.keys() ^ tensors.keys()):
-        raise ValueError(f"the tensor {unknown[0]!r} is {'missing' if unknown[0] in own else 'not that of a ' + name}")
+    state, tables, logs = prior.state_dict(), _names(prior, "tables"), _names(prior, "log_tables")
+    if unknown := sorted(state.keys() ^ tensors.keys()):
+        raise ValueError(
+            f"the tensor {unknown[0]!r} is {'missing' if unknown[0] in state else 'not that of a ' + name}"
+        )
     for key, value in tensors.items():
-        expected = own[key]
+        expected = state[key]
         fits = value.dim() == expected.dim() if key in tables else value.shape == expected.shape
         if value.dtype != expected.dtype or not fits:
             raise ValueError(

@@ -63,8 +63,8 @@ def _cuts(probs: Array) -> Array:
             cut[state, run] = (uint64(2**32 - 1) << uint64(32)) | uint64(run)
         for run in small[:few]:
             best = np.argmax(probs[state])
-            own = run if probs[state, run] > 0 else best
-            cut[state, run] = uint64(own)
+            alias = run if probs[state, run] > 0 else best
+            cut[state, run] = uint64(alias)
     return cut
 
 
@@ -94,7 +94,7 @@ def draw(table: Tables, start: Array, ends: Array, seed: int, first: int, plans:
             mixed = (mixed ^ (mixed >> uint64(27))) * _SECOND
             mixed ^= mixed >> uint64(31)
             column = ((mixed >> uint64(32)) * runs) >> uint64(32)
-            here = cut[state, column]
-            run = column if (mixed & low) < (here >> uint64(32)) else here & low
+            entry = cut[state, column]
+            run = column if (mixed & low) < (entry >> uint64(32)) else entry & low
             plans[i, r] = actions[run]
             state = after[state, run]

@@ -108,15 +108,14 @@ class ContextTreePrior(HistoryPrior):
 
     @property
     def config(self) -> dict[str, Any]:
-        own = {"depth": self.depth, "beta": self.beta, "alpha": self.alpha, "base": self.base}
-        return super().config | own
+        return super().config | {"depth": self.depth, "beta": self.beta, "alpha": self.alpha, "base": self.base}
 
     def log_evidence(self) -> float:
         """The log-probability, in nats, of all actions of the training plans, averaged over all trees and parameters.
 
         The higher, the better the depth, beta and alpha describe the plans. 0 before `fit`.
         """
-        return self._weighting(*self._learned()).evidence(self.pseudo_counts)
+        return self._weighting(*self._tree_and_counts()).evidence(self.pseudo_counts)
 
     def map_tree(self) -> list[Leaf]:
         """The most probable tree after training: its leaves that occurred in the plans, the shortest first.
@@ -124,7 +123,7 @@ class ContextTreePrior(HistoryPrior):
         This is the BCT algorithm of Kontoyiannis et al. 2022. Of equally probable trees it is the smallest. Empty
         before `fit`.
         """
-        tree, counts = self._learned()
+        tree, counts = self._tree_and_counts()
         num, contexts = len(counts.row_code), self.num_contexts or 1
         if num == 0:
             return []
@@ -160,12 +159,12 @@ class ContextTreePrior(HistoryPrior):
             base = (counts + kinds * base) / (counts.sum() + kinds)
         if self.alpha is not None or weighting.num == 0:
             return base * actions * (0.5 if self.alpha is None else self.alpha)
-        found = {size: weighting.evidence(base * size) for size in (1.0, 2.0, 4.0)}
-        while (best := max(found, key=lambda size: found[size])) in (min(found), max(found)):
-            further = best / 2 if best == min(found) else best * 2
+        evidence = {size: weighting.evidence(base * size) for size in (1.0, 2.0, 4.0)}
+        while (best := max(evidence, key=lambda size: evidence[size])) in (min(evidence), max(evidence)):
+            further = best / 2 if best == min(evidence) else best * 2
             if not 1 / 4 <= further <= 64:
                 break
-            found[further] = weighting.evidence(base * further)
+            evidence[further] = weighting.evidence(base * further)
         return base * best
 
     def tables_fit(self) -> bool:
@@ -187,7 +186,7 @@ class ContextTreePrior(HistoryPrior):
     def _weighting(self, tree: Tree, counts: Counts) -> "Weighting":
         return Weighting(tree, counts, self.num_contexts, self.num_actions, self.depth, self.beta)
 
-    def _learned(self) -> tuple[Tree, Counts]:
+    def _tree_and_counts(self) -> tuple[Tree, Counts]:
         tree = Tree(self.next_node, self.parent, int(self.start_node), self.bounds.tolist())
         row, action = self.pair_row.long(), self.pair_action.long()
         return tree, Counts(self.row_code, row, action, self.pair_count, self.pair_count)
@@ -244,18 +243,18 @@ class Weighting:
         missing = torch.full_like(leaf, self.num_actions)
         missing[self.num] = self.contexts
         for level in range(len(self.ends) - 2, -2, -1):
-            here = slice(self.ends[level], self.ends[level + 1]) if level >= 0 else slice(self.num, self.num + 1)
+            rows = slice(self.ends[level], self.ends[level + 1]) if level >= 0 else slice(self.num, self.num + 1)
             if level < self.depth:
-                leaf[here] += math.log(self.beta)
-                branch = parts[here] + math.log1p(-self.beta)
+                leaf[rows] += math.log(self.beta)
+                branch = parts[rows] + math.log1p(-self.beta)
                 if best:
-                    branch += missing[here] * absent[level + 1]
-                whole[here] = torch.maximum(leaf[here], branch) if best else torch.logaddexp(leaf[here], branch)
+                    branch += missing[rows] * absent[level + 1]
+                whole[rows] = torch.maximum(leaf[rows], branch) if best else torch.logaddexp(leaf[rows], branch)
             if level >= 0:
-                parts.index_add_(0, self.parent[here], whole[here])
+                parts.index_add_(0, self.parent[rows], whole[rows])
                 # A beginning has no tree below it, so only missing actions cost something.
                 if best and level <= self.depth:
-                    missing.index_add_(0, self.parent[here], -torch.ones_like(whole[here]))
+                    missing.index_add_(0, self.parent[rows], -torch.ones_like(whole[rows]))
         return leaf, whole
 
     def evidence(self, pseudo: Tensor) -> float:
@@ -276,14 +275,14 @@ class Weighting:
             table[-1] = stop[-1] * _mean(self.pooled, pseudo)
             rest[-1] -= stop[-1]
         for _, first, until in self.blocks:
-            here, up = slice(first, until), self.parent[first:until]
+            rows, up = slice(first, until), self.parent[first:until]
             mean = _mean(self.counts.dense(first, until, self.num_actions, self.counts.count), pseudo)
-            table[here] = table[up] + mean.mul_((rest[up] * stop[here])[:, None])
-            rest[here] = rest[up] * (1 - stop[here])
+            table[rows] = table[up] + mean.mul_((rest[up] * stop[rows])[:, None])
+            rest[rows] = rest[up] * (1 - stop[rows])
         # Histories further back than the longest that occurred have no counts: their leaves have the mean `base`.
         for first in range(0, self.num + 1, max(2**22 // self.num_actions, 1)):
-            here = slice(first, first + max(2**22 // self.num_actions, 1))
-            table[here] = (table[here] + rest[here, None] * base).log()
+            rows = slice(first, first + max(2**22 // self.num_actions, 1))
+            table[rows] = (table[rows] + rest[rows, None] * base).log()
         return table
 
     def best_leaves(self, pseudo: Tensor) -> Tensor:
@@ -301,9 +300,9 @@ class Weighting:
         """`[n, A]`, float64: what followed `rows [n]`."""
         place = torch.full((self.num + 1,), -1, device=rows.device)
         place[rows] = torch.arange(len(rows), device=rows.device)
-        here = place[self.counts.row] >= 0
+        inside = place[self.counts.row] >= 0
         n = torch.zeros(len(rows), self.num_actions, dtype=torch.double, device=rows.device)
-        n[place[self.counts.row[here]], self.counts.action[here]] = self.counts.count[here].double()
+        n[place[self.counts.row[inside]], self.counts.action[inside]] = self.counts.count[inside].double()
         n[rows == self.num] = self.pooled
         return n
 

@@ -79,9 +79,9 @@ class Counts:
 
     def dense(self, first: int, until: int, num_actions: int, values: Tensor) -> Tensor:
         """`values [P]` of the rows from `first` to `until` - 1 as a table `[until - first, A]`, float64."""
-        here = slice(int(torch.searchsorted(self.row, first)), int(torch.searchsorted(self.row, until)))
+        span = slice(int(torch.searchsorted(self.row, first)), int(torch.searchsorted(self.row, until)))
         table = torch.zeros(until - first, num_actions, dtype=torch.double, device=self.row.device)
-        table[self.row[here] - first, self.action[here]] = values[here].double()
+        table[self.row[span] - first, self.action[span]] = values[span].double()
         return table
 
 
@@ -141,15 +141,15 @@ def count_histories(
         histories.add(*_ngrams(plans.actions, depth + 1, plans.num_actions, size, device), begins=False)
         return histories.finish(openings)
     for at in range(0, len(plans), size):
-        part = plans[at : at + size]
-        actions, here, context = part.actions.to(device).long(), None, None
-        if part.lengths is not None:
-            actions = actions[:, : int(part.lengths.max())]
-            here = part.mask()[:, : actions.shape[1]].to(device)
-        if num_contexts is not None and part.context is not None:
-            context = part.context.to(device).long()
+        chunk = plans[at : at + size]
+        actions, mask, context = chunk.actions.to(device).long(), None, None
+        if chunk.lengths is not None:
+            actions = actions[:, : int(chunk.lengths.max())]
+            mask = chunk.mask()[:, : actions.shape[1]].to(device)
+        if num_contexts is not None and chunk.context is not None:
+            context = chunk.context.to(device).long()
             context = context[:, : actions.shape[1]]
-        histories.add(actions, None, here, context)
+        histories.add(actions, None, mask, context)
     return histories.finish(openings)
 
 
@@ -161,14 +161,14 @@ def _ngrams(actions: Tensor, length: int, num_actions: int, size: int, device: t
     times = torch.zeros(num_actions**length, dtype=torch.long, device=device)
     last, alone = actions.shape[1] - length + 1, Lock()
 
-    def count(part: Tensor) -> None:
-        part = part.to(device)
-        code = part[:, :last].to(torch.int32, copy=True)
+    def count(chunk: Tensor) -> None:
+        chunk = chunk.to(device)
+        code = chunk[:, :last].to(torch.int32, copy=True)
         for place in range(1, length):
-            code = code.mul_(num_actions).add_(part[:, place : place + last])
-        found = code.flatten().bincount(minlength=len(times))
+            code = code.mul_(num_actions).add_(chunk[:, place : place + last])
+        counts = code.flatten().bincount(minlength=len(times))
         with alone:
-            times.add_(found)
+            times.add_(counts)
 
     share(count, actions.split(size))
     codes = times.nonzero()[:, 0]
@@ -231,11 +231,11 @@ class _Histories:
         self,
         actions: Tensor,
         times: Tensor | None,
-        here: Tensor | None = None,
+        mask: Tensor | None = None,
         context: Tensor | None = None,
         begins: bool = True,
     ) -> None:
-        """Count `actions [n, L]` (int64) where `here [n, L]` is True (None: everywhere), in contexts `context [n, L]`.
+        """Count `actions [n, L]` (int64) where `mask [n, L]` is True (None: everywhere), in contexts `context [n, L]`.
 
         With `times [n]` each row counts so often; it then has at most `depth` + 1 actions. `begins` says whether rows
         are the beginnings of plans.
@@ -244,16 +244,16 @@ class _Histories:
         node, opening = torch.zeros_like(actions), torch.zeros_like(actions[:, :1])
         for t in range(min(depth, length)):
             if begins:
-                self._count(self.openings[t], opening, actions, context, here, slice(t, t + 1), times)
+                self._count(self.openings[t], opening, actions, context, mask, slice(t, t + 1), times)
             if t + 1 == length:
                 return
-            now, after = actions[:, t:-1], None if here is None else here[:, t + 1 :]
+            now, after = actions[:, t:-1], None if mask is None else mask[:, t + 1 :]
             node = self._go(self.levels, t, node[:, :-1], now, node[:, 1:], after)
             if begins and t + 1 < depth:
                 first = None if after is None else after[:, :1]
                 opening = self._go(self.openings, t, opening, now[:, :1], node[:, :1], first)
         if length > depth:
-            self._count(self.levels[depth], node, actions, context, here, slice(depth, None), times)
+            self._count(self.levels[depth], node, actions, context, mask, slice(depth, None), times)
 
     def _count(
         self,
@@ -261,26 +261,26 @@ class _Histories:
         node: Tensor,
         actions: Tensor,
         context: Tensor | None,
-        here: Tensor | None,
+        mask: Tensor | None,
         steps: slice,
         times: Tensor | None,
     ) -> None:
         """Count the actions of some steps, which followed `node`."""
         row = node if context is None else node * self.contexts + context[:, steps]
         codes = row * self.num_actions + actions[:, steps]
-        codes = codes.reshape(-1) if here is None else codes[here[:, steps]]
+        codes = codes.reshape(-1) if mask is None else codes[mask[:, steps]]
         level.tally.add(codes, len(level) * self.contexts * self.num_actions, times)
 
     def _go(
-        self, levels: list[_Level], t: int, node: Tensor, actions: Tensor, parent: Tensor, here: Tensor | None
+        self, levels: list[_Level], t: int, node: Tensor, actions: Tensor, parent: Tensor, mask: Tensor | None
     ) -> Tensor:
         """The nodes of level t + 1 that `actions` lead to from nodes of level t; new ones are added."""
         level, below = levels[t], levels[t + 1]
         codes = node * self.num_actions + actions
-        found = level.follow.view(-1)[codes]
-        new = found < 0 if here is None else (found < 0) & here
+        nodes = level.follow.view(-1)[codes]
+        new = nodes < 0 if mask is None else (nodes < 0) & mask
         if bool(new.any()):
-            distinct, rank = _ranked(codes[new], level.follow.numel())
+            distinct, rank = _rank(codes[new], level.follow.numel())
             self._check_size(len(distinct))
             level.follow.view(-1)[distinct] = torch.arange(
                 len(below), len(below) + len(distinct), dtype=torch.int32, device=codes.device
@@ -288,9 +288,9 @@ class _Histories:
             parents = torch.empty_like(distinct)
             parents[rank] = parent[new]
             below.extend(parents, last=t + 2 == len(levels))
-            found = level.follow.view(-1)[codes]
+            nodes = level.follow.view(-1)[codes]
         # Beyond the end of a plan there may be no node; nothing is counted there.
-        return found.long() if here is None else found.long().clamp_(min=0)
+        return nodes.long() if mask is None else nodes.long().clamp_(min=0)
 
     def _check_size(self, more: int, rows: int | None = None) -> None:
         nodes = more + sum(len(level) for level in (*self.levels, *self.openings))
@@ -354,7 +354,7 @@ class _Histories:
         return Tree(next_node, torch.cat(parents), start, bounds)
 
 
-def _ranked(codes: Tensor, below: int) -> tuple[Tensor, Tensor]:
+def _rank(codes: Tensor, below: int) -> tuple[Tensor, Tensor]:
     """The distinct codes, all below `below`, in ascending order, and the rank of each code among them."""
     if below > 4 * len(codes) + 2**16:
         distinct, rank = torch.unique(codes, return_inverse=True)

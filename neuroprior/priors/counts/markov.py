@@ -100,8 +100,8 @@ class MarkovPrior(HistoryPrior):
 
     @property
     def config(self) -> dict[str, Any]:
-        own = {"order": self.order, "smoothing": self.smoothing, "initial": self.initial, "backoff": self.backoff}
-        return super().config | own
+        settings = {"order": self.order, "smoothing": self.smoothing, "initial": self.initial, "backoff": self.backoff}
+        return super().config | settings
 
     def estimate(self, tree: Tree, counts: Counts) -> Tensor:
         smoothing = torch.tensor([self.smoothing], dtype=torch.double, device=counts.row.device)
@@ -140,17 +140,17 @@ def back_off_log_probs(
     values = counts.kinds if rule == "kneser-ney" else counts.count
     root = torch.full((len(smoothing), 1, num_actions), 1 / num_actions, dtype=torch.double, device=smoothing.device)
     if num_contexts is not None:
-        root = _pooled(counts, contexts, root, rule, each)
+        root = _pool_contexts(counts, contexts, root, rule, each)
     table = torch.empty(len(smoothing), len(counts.row_code) + 1, num_actions, device=root.device)
     table[:, -1:] = root.clamp(min=1e-300).log()
     if not len(counts.row_code):  # of a prior that has not learned yet
         return table
     parent = parent_rows(tree, counts, contexts)
-    discounts, known, ends = torch.zeros(3), -1, level_bounds(tree, counts, contexts)
+    discounts, discount_level, ends = torch.zeros(3), -1, level_bounds(tree, counts, contexts)
     for level, first, until in row_blocks(tree, counts, contexts, num_actions):
-        if rule == "kneser-ney" and level != known:
-            here = torch.searchsorted(counts.row, torch.tensor(ends[level : level + 2], device=root.device))
-            discounts, known = kneser_ney_discounts(values[here[0] : here[1]]), level
+        if rule == "kneser-ney" and level != discount_level:
+            span = torch.searchsorted(counts.row, torch.tensor(ends[level : level + 2], device=root.device))
+            discounts, discount_level = kneser_ney_discounts(values[span[0] : span[1]]), level
         # The table holds logarithms, as a probability may be too small for float32.
         lower = table[:, parent[first:until]].double().exp()
         n = counts.dense(first, until, num_actions, values)
@@ -179,9 +179,9 @@ def discounted(n: Tensor, discounts: Tensor, smoothing: Tensor | float) -> Tenso
     return (torch.cat([discounts.new_zeros(1), discounts])[n.clamp(max=3).long()] * smoothing).minimum(n)
 
 
-def interpolate(kept: Tensor, given: Tensor, total: Tensor, lower: Tensor) -> Tensor:
-    """Probabilities from counts that are `kept`, and the mass that is `given` to `lower`, of a `total` of both."""
-    return torch.where(total > 0, (kept + given * lower) / total.clamp(min=1e-300), lower)
+def interpolate(kept: Tensor, mass: Tensor, total: Tensor, lower: Tensor) -> Tensor:
+    """Probabilities from counts that are `kept`, and the `mass` that goes to `lower`, of a `total` of both."""
+    return torch.where(total > 0, (kept + mass * lower) / total.clamp(min=1e-300), lower)
 
 
 def entry_log_probs(
@@ -201,7 +201,7 @@ def entry_log_probs(
     number, values = len(counts.row_code), (counts.kinds if rule == "kneser-ney" else counts.count).double()
     root = torch.full((len(smoothing), 1, num_actions), 1 / num_actions, dtype=torch.double, device=entry.device)
     if num_contexts is not None:
-        root = _pooled(counts, contexts, root, rule, smoothing[:, None, None])
+        root = _pool_contexts(counts, contexts, root, rule, smoothing[:, None, None])
     probs = root[:, 0, action]
     if rule == "kneser-ney":
         ends = torch.tensor(level_bounds(tree, counts, contexts), device=entry.device)
@@ -212,22 +212,22 @@ def entry_log_probs(
             ],
             1,
         )
-        kept, given = values - off, _row_sums(counts, off)
+        kept, mass = values - off, _row_sums(counts, off)
         total = _row_sums(counts, values[None])
     else:
         kinds = _row_sums(counts, torch.ones_like(values)[None]) if rule == "witten-bell" else torch.ones(1, number)
-        kept, given = values.expand(len(smoothing), -1), kinds.double() * smoothing[:, None]
-        total = _row_sums(counts, values[None]) + given
+        kept, mass = values.expand(len(smoothing), -1), kinds.double() * smoothing[:, None]
+        total = _row_sums(counts, values[None]) + mass
     code, parent = counts.row * num_actions + counts.action, parent_rows(tree, counts, contexts)
     above = [row]
     while bool((above[-1] < number).any()):
         above.append(torch.cat([parent, parent.new_tensor([number])])[above[-1]])
-    for here in reversed(above):
-        inside = (here < number).nonzero()[:, 0]
-        rows, wanted = here[inside], here[inside] * num_actions + action[inside]
+    for ancestor in reversed(above):
+        inside = (ancestor < number).nonzero()[:, 0]
+        rows, wanted = ancestor[inside], ancestor[inside] * num_actions + action[inside]
         place = torch.searchsorted(code, wanted).clamp(max=len(code) - 1)
         there = kept[:, place] * (code[place] == wanted)
-        probs[:, inside] = interpolate(there, given[:, rows], total[:, rows], probs[:, inside])
+        probs[:, inside] = interpolate(there, mass[:, rows], total[:, rows], probs[:, inside])
     return probs.clamp(min=1e-300).log()
 
 
@@ -247,10 +247,10 @@ def kneser_ney_discounts(counts: Tensor) -> Tensor:
     if 0 in number[:3]:
         return torch.tensor(FALLBACK_DISCOUNTS, dtype=torch.double, device=counts.device)
     common = number[0] / (number[0] + 2 * number[1])
-    found = [k - (k + 1) * common * number[k] / number[k - 1] for k in (1, 2, 3)]
-    if not all(0 < d <= k for k, d in enumerate(found, 1)):
-        found = list(FALLBACK_DISCOUNTS)
-    return torch.tensor(found, dtype=torch.double, device=counts.device)
+    discounts = [k - (k + 1) * common * number[k] / number[k - 1] for k in (1, 2, 3)]
+    if not all(0 < d <= k for k, d in enumerate(discounts, 1)):
+        discounts = list(FALLBACK_DISCOUNTS)
+    return torch.tensor(discounts, dtype=torch.double, device=counts.device)
 
 
 class Chains:
@@ -291,24 +291,24 @@ class Chains:
         entry = self._first.entries(plans if self.num_contexts is not None else plans.without_context())
         entry, times = entry.unique(return_counts=True)
         sums = []
-        for rule, some in groupby(BACKOFFS_TRIED, key=itemgetter(0)):
-            smoothing = torch.tensor([each for _, each in some], dtype=torch.double, device=entry.device)
-            found = entry_log_probs(*self._counted, self.num_contexts, plans.num_actions, rule, smoothing, entry)
-            sums.append(found @ times.double())
+        for rule, pairs in groupby(BACKOFFS_TRIED, key=itemgetter(0)):
+            smoothing = torch.tensor([each for _, each in pairs], dtype=torch.double, device=entry.device)
+            log_probs = entry_log_probs(*self._counted, self.num_contexts, plans.num_actions, rule, smoothing, entry)
+            sums.append(log_probs @ times.double())
         return torch.cat(sums).cpu()
 
     def chain(self, number: int) -> MarkovPrior:
         """The chain with the back-off of that number."""
         backoff, smoothing = BACKOFFS_TRIED[number]
-        made = MarkovPrior(
+        prior = MarkovPrior(
             self.plans.num_actions, self.order, smoothing, num_contexts=self.num_contexts, backoff=backoff
         )
-        training_plans(made, self.plans)
-        made.learn(*self._counted)
-        return made
+        training_plans(prior, self.plans)
+        prior.learn(*self._counted)
+        return prior
 
 
-def _pooled(counts: Counts, contexts: int, lower: Tensor, rule: Backoff, smoothing: Tensor) -> Tensor:
+def _pool_contexts(counts: Counts, contexts: int, lower: Tensor, rule: Backoff, smoothing: Tensor) -> Tensor:
     """The probabilities `[S, 1, A]` in all contexts together."""
     if rule != "kneser-ney":
         n = counts.pooled(contexts, lower.shape[-1], counts.count)

@@ -121,7 +121,7 @@ def fitted_experts(
     for others, (name, prior) in zip(range(len(untrained), 0, -1), untrained.items(), strict=True):
         how = {"validation": held_out, **settings}
         if names is None and until > monotonic():
-            promise = screen(prior, forecasts, learned, held_out, _within(how, until, 8 * others))
+            promise = screen(prior, forecasts, learned, held_out, _limit_seconds(how, until, 8 * others))
             if promise is not None and not promise.pays:
                 experts.left_out[name] = promise
                 if shown:
@@ -130,12 +130,12 @@ def fitted_experts(
                 break  # what a network that sees the whole past cannot find, those behind it cannot either
         if until <= monotonic():
             break
-        prior.fit(plans_for(prior, learned), generator=generator, **_within(how, until, others))
+        prior.fit(plans_for(prior, learned), generator=generator, **_limit_seconds(how, until, others))
         experts.networks[name] = prior
     return experts
 
 
-def _within(settings: dict[str, Any], until: float, parts: int) -> dict[str, Any]:
+def _limit_seconds(settings: dict[str, Any], until: float, parts: int) -> dict[str, Any]:
     """The settings of a training that takes one of so many parts of the seconds that are left, if these are limited."""
     return settings if until == inf else {**settings, "seconds": max(until - monotonic(), 0.0) / parts}
 
@@ -165,9 +165,9 @@ def counted(learned: Plans, held_out: Plans, contexts: dict[str, int]) -> Iterat
     yield UniformPrior(learned.num_actions).fit(learned.without_context())
     simple: list[Prior] = []
     for number in [None] if num_contexts is None else [None, num_contexts]:
-        found = best_chain(parts, number)
-        if found is not None:
-            simple.append(found)
+        chain = best_chain(parts, number)
+        if chain is not None:
+            simple.append(chain)
         try:
             tree = ContextTreePrior(learned.num_actions, DEPTH, num_contexts=number)
             simple.append(tree.fit(plans_for(tree, learned)))
@@ -186,18 +186,18 @@ def counting_parts(learned: Plans, held_out: Plans) -> list[tuple[Plans, Plans]]
     A chain is chosen of many, and a few plans say little of which is best. Groups stay together where they are so equal
     that enough is left to count in; where plans are not either, they are cut into pieces.
     """
-    given, total = [(learned, held_out)], int(learned.mask().sum())
+    pairs, total = [(learned, held_out)], int(learned.mask().sum())
     if int(held_out.mask().sum()) >= ENOUGH or not 1 < total <= MOST:
-        return given
+        return pairs
     plans = divisible(learned[learned.mask().any(1)])
     if len(plans) == 1:
         plans = in_parts(plans, min(FOLDS, total))
-    for some in (plans, ungrouped(plans), pieces(plans, -(-total // PIECES))):
-        divisions = folds(some, min(FOLDS, num_units(some)))
-        parts = [(some[rest], some[left_out]) for rest, left_out in divisions]
+    for units in (plans, ungrouped(plans), pieces(plans, -(-total // PIECES))):
+        divisions = folds(units, min(FOLDS, num_units(units)))
+        parts = [(units[rest], units[left_out]) for rest, left_out in divisions]
         if min(int(rest.mask().sum()) for rest, _ in parts) >= LEAST_REST * total:
-            return given + parts
-    return given
+            return pairs + parts
+    return pairs
 
 
 @torch.no_grad()

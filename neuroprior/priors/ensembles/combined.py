@@ -131,8 +131,8 @@ class CombinedPrior(MixturePrior):
         check_effort(effort)
         if networks is not None:
             check_choices("networks", networks, OF_EFFORT[effort], 0)
-        made = [UniformPrior(num_actions)] if experts is None else experts
-        super().__init__(num_actions, made, share, num_contexts, context_size)
+        first_experts = [UniformPrior(num_actions)] if experts is None else experts
+        super().__init__(num_actions, first_experts, share, num_contexts, context_size)
         self.effort: Effort = effort
         self.networks: tuple[str, ...] | None = None if networks is None else tuple(networks)
         self.trained: tuple[str, ...] = ()
@@ -159,19 +159,21 @@ class CombinedPrior(MixturePrior):
     @property
     def learned(self) -> dict[str, Any]:
         every = [*self.alternatives, *self.left_out]
-        given = None if self.given is None else [every.index(e) for e in self.given[0]]
-        own = {"tried": self.tried, "given": given, "kept": self.config["experts"], "trained": list(self.trained)}
-        for name, some in (("spare", self.spare), ("left_out", self.left_out)):
-            own[name] = [described(e) | {"learned": e.learned} for e in priors_in(some)]
-        return super().learned | own
+        numbers = None if self.given is None else [every.index(e) for e in self.given[0]]
+        fields = {"tried": self.tried, "given": numbers, "kept": self.config["experts"], "trained": list(self.trained)}
+        for name, modules in (("spare", self.spare), ("left_out", self.left_out)):
+            fields[name] = [described(e) | {"learned": e.learned} for e in priors_in(modules)]
+        return super().learned | fields
 
     def restore(self, learned: dict[str, Any]) -> None:
         # Experts that were given stay the objects that they are: a planner may sample from one of them.
         numbers, mine = learned.get("given"), [] if self.given is None else self.given[0]
-        own = dict(zip(numbers, mine, strict=True)) if isinstance(numbers, list) and len(numbers) == len(mine) else {}
+        by_number = (
+            dict(zip(numbers, mine, strict=True)) if isinstance(numbers, list) and len(numbers) == len(mine) else {}
+        )
         place = len(learned.get("kept", self.experts))
         if "kept" in learned:
-            kept = [_restored(own.get(number), e) for number, e in enumerate(learned["kept"])]
+            kept = [_restore_expert(by_number.get(number), e) for number, e in enumerate(learned["kept"])]
             self.experts = nn.ModuleList(kept).to(self.device)
         super().restore(learned)
         if not isinstance(learned["tried"], int) or learned["tried"] < 0:
@@ -179,7 +181,7 @@ class CombinedPrior(MixturePrior):
         self.tried, self.trained = learned["tried"], tuple(learned.get("trained", ()))
         for name in ("spare", "left_out"):
             described_ones = learned.get(name, [])
-            aside = [_restored(own.get(place + number), e) for number, e in enumerate(described_ones)]
+            aside = [_restore_expert(by_number.get(place + number), e) for number, e in enumerate(described_ones)]
             place += len(aside)
             for e, one in zip(aside, described_ones, strict=True):
                 e.restore(one["learned"])
@@ -192,25 +194,27 @@ class CombinedPrior(MixturePrior):
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, State]:
         self.check_start(batch_size, context)
-        found = start_experts(self._experts(), batch_size, context)
-        return self._mixed_now(self.first.expand(batch_size, -1), self.tracking.expand(batch_size, -1), found)
+        outputs = start_experts(self._experts(), batch_size, context)
+        return self._mix_tracking(self.first.expand(batch_size, -1), self.tracking.expand(batch_size, -1), outputs)
 
     def step(self, action: Tensor, state: Any, context: Tensor | None = None) -> tuple[Tensor, State]:
         self.check_step(action, context)
         weights, tracking, forecasts, *states = state
-        found = step_experts(self._experts(), action, states, context)
+        outputs = step_experts(self._experts(), action, states, context)
         taken = taken_of(forecasts, action)
         weights = after(weights, taken, self.first, 0)
         if self.share:
             tracking = after(tracking, taken[:, :-1], self.tracking, self.share)
-        return self._mixed_now(weights, tracking, found)
+        return self._mix_tracking(weights, tracking, outputs)
 
-    def _mixed_now(self, weights: Tensor, tracking: Tensor, found: list[tuple[Tensor, State]]) -> tuple[Tensor, State]:
+    def _mix_tracking(
+        self, weights: Tensor, tracking: Tensor, outputs: list[tuple[Tensor, State]]
+    ) -> tuple[Tensor, State]:
         """The logits `[N, A]` and the state, from all weights and from what the experts returned."""
-        forecasts = with_pool(torch.stack([logits.log_softmax(-1) for logits, _ in found], 1), self.powers)
+        forecasts = with_pool(torch.stack([logits.log_softmax(-1) for logits, _ in outputs], 1), self.powers)
         if self.share:
             forecasts = torch.cat([forecasts, mixed(tracking, forecasts)[:, None]], 1)
-        return mixed(weights, forecasts), (weights, tracking, forecasts, *(state for _, state in found))
+        return mixed(weights, forecasts), (weights, tracking, forecasts, *(state for _, state in outputs))
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         if plans.shape[1] == 0:
@@ -362,35 +366,35 @@ def chosen_on(
     forecasts = stack_forecasts(experts, plans)
     held_out = HeldOut(forecasts, plans.actions, plans.mask(), tried)
     parts = [] if learned is None or not counting else counting_parts(learned, plans)
-    if len(parts) < 2 or sum(part.actions.numel() for _, part in parts) * forecasts[0, 0].numel() > MOST_NUMBERS:
+    if len(parts) < 2 or sum(scored.actions.numel() for _, scored in parts) * forecasts[0, 0].numel() > MOST_NUMBERS:
         kept, powers = held_out.choose(costs, gains)
         return held_out.of(kept), kept, powers
-    found = [(forecasts[:, :, counting], plans.actions, held_out.mask)]
+    triples = [(forecasts[:, :, counting], plans.actions, held_out.mask)]
     for rest, left_out in parts[1:]:
         counted = [deepcopy(experts[number]).fit(plans_for(experts[number], rest)) for number in counting]
-        found.append((stack_forecasts(counted, left_out), left_out.actions, left_out.mask()))
-    every, actions, mask = map(_joined, zip(*found, strict=True))
-    known = HeldOut(every, actions, mask, tried)
-    best, powers = known.choose([costs[number] for number in counting])
+        triples.append((stack_forecasts(counted, left_out), left_out.actions, left_out.mask()))
+    every, actions, mask = map(_pad_and_join, zip(*triples, strict=True))
+    counting_held_out = HeldOut(every, actions, mask, tried)
+    best, powers = counting_held_out.choose([costs[number] for number in counting])
     chosen = [counting[number] for number in best]
     both = chosen + [number for number in range(len(experts)) if number not in counting]
     few = held_out.of(both, torch.cat([powers, powers.new_zeros(len(both) - len(chosen))]))
     kept, new_powers = few.choose([costs[number] for number in both], [gains[number] for number in both], len(chosen))
     if len(kept) == len(chosen):
-        return known.of(best), chosen, powers
+        return counting_held_out.of(best), chosen, powers
     return few.of(kept), [both[number] for number in kept], new_powers
 
 
-def _joined(values: Sequence[Tensor]) -> Tensor:
+def _pad_and_join(values: Sequence[Tensor]) -> Tensor:
     """Tensors `[N_i, L_i, ...]` as one, `[sum of N_i, max of L_i, ...]`, filled up with zeros."""
     longest = max(each.shape[1] for each in values)
     return torch.cat([torch.cat([v, v.new_zeros(len(v), longest - v.shape[1], *v.shape[2:])], 1) for v in values])
 
 
-def _restored(own: Prior | None, description: Mapping[str, Any]) -> Prior:
-    """The expert that is described: that of one's own, if this is alike but for what `fit` chose, or a new one."""
-    if own is not None and type(own).__name__ == description["prior"]:
-        given = {name: value for name, value in own.config.items() if value is not None and name != "seed"}
-        if all(description["config"].get(name) == value for name, value in given.items()):
-            return own
+def _restore_expert(expert: Prior | None, description: Mapping[str, Any]) -> Prior:
+    """The expert that is described: `expert`, if this is alike but for what `fit` chose, or a new one."""
+    if expert is not None and type(expert).__name__ == description["prior"]:
+        settings = {name: value for name, value in expert.config.items() if value is not None and name != "seed"}
+        if all(description["config"].get(name) == value for name, value in settings.items()):
+            return expert
     return as_prior(description)

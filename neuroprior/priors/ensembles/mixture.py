@@ -75,24 +75,24 @@ class MixturePrior(Prior):
         if not experts:
             raise ValueError("`experts` must have at least one prior")
         check_share("share", share)
-        made = [as_prior(e) for e in experts]
-        for number, expert in enumerate(made):
-            if expert in made[:number]:
+        priors = [as_prior(e) for e in experts]
+        for number, expert in enumerate(priors):
+            if expert in priors[:number]:
                 raise ValueError(f"experts[{number}]: the same prior is given twice; give another, or a copy")
             if expert.num_actions != num_actions:
                 raise ValueError(f"experts[{number}]: has {expert.num_actions} actions, the mixture {num_actions}")
         for what in ("action_names", "context_names"):
-            names = {f"experts[{number}]": getattr(e, what) for number, e in enumerate(made)}
+            names = {f"experts[{number}]": getattr(e, what) for number, e in enumerate(priors)}
             check_alike_named(names, "fit them to plans that are numbered alike", what)
-        given = {(num_contexts, context_size)} - {(None, None)}
-        contexts = given | {(e.num_contexts, e.context_size) for e in made if e.takes_context} or {(None, None)}
+        sizes = {(num_contexts, context_size)} - {(None, None)}
+        contexts = sizes | {(e.num_contexts, e.context_size) for e in priors if e.takes_context} or {(None, None)}
         if len(contexts) > 1:
             raise ValueError(f"experts: those with a context must have the same, not {sorted(map(str, contexts))}")
         super().__init__(num_actions, *contexts.pop())
-        self._take_over([e for e in made if e.has_learned])
-        self.experts = nn.ModuleList(made)
+        self._take_over([e for e in priors if e.has_learned])
+        self.experts = nn.ModuleList(priors)
         self.share = float(share)
-        self.register_buffer("first", torch.full((len(made),), 1 / len(made)).log())
+        self.register_buffer("first", torch.full((len(priors),), 1 / len(priors)).log())
 
     def _take_over(self, learned: Sequence[Prior]) -> None:
         """Know what experts know that have learned: the names, the end, and the kind of context."""
@@ -121,20 +121,20 @@ class MixturePrior(Prior):
         if not isinstance(learned["share"], float) or not 0 <= learned["share"] <= 1:
             raise ValueError(f"`share` must be a number between 0 and 1, got {learned['share']!r}")
         self.share = learned["share"]
-        for expert, own in zip(self._experts(), learned["experts"], strict=True):
-            expert.restore(own)
+        for expert, expert_learned in zip(self._experts(), learned["experts"], strict=True):
+            expert.restore(expert_learned)
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, State]:
         self.check_start(batch_size, context)
-        found = start_experts(self._experts(), batch_size, context)
+        outputs = start_experts(self._experts(), batch_size, context)
         weights = self.first.expand(batch_size, -1)
-        return self._mixed(weights, found)
+        return self._mix(weights, outputs)
 
     def step(self, action: Tensor, state: Any, context: Tensor | None = None) -> tuple[Tensor, State]:
         self.check_step(action, context)
         weights, forecasts, *states = state
-        found = step_experts(self._experts(), action, states, context)
-        return self._mixed(after(weights, taken_of(forecasts, action), self.first, self.share), found)
+        outputs = step_experts(self._experts(), action, states, context)
+        return self._mix(after(weights, taken_of(forecasts, action), self.first, self.share), outputs)
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         if plans.shape[1] == 0:
@@ -174,9 +174,9 @@ class MixturePrior(Prior):
     ) -> None:
         """Fit each expert to `learned`; networks are stopped early by `held_out`."""
         for expert in self._experts():
-            known = {"validation": held_out, **settings}
-            known = {name: value for name, value in known.items() if name in expert.fit_settings}
-            expert.fit(plans_for(expert, learned), generator=generator, **known)
+            expert_settings = {"validation": held_out, **settings}
+            expert_settings = {name: value for name, value in expert_settings.items() if name in expert.fit_settings}
+            expert.fit(plans_for(expert, learned), generator=generator, **expert_settings)
 
     def recount(self, plans: Plans) -> Self:
         plans = counted_plans(self, plans)
@@ -207,9 +207,9 @@ class MixturePrior(Prior):
         """`[N, L, E, A]`: the log-probabilities of each expert."""
         return torch.stack([e(plans, context_for(e, context)).log_softmax(-1) for e in self._experts()], 2)
 
-    def _mixed(self, weights: Tensor, found: list[tuple[Tensor, State]]) -> tuple[Tensor, State]:
-        forecasts = torch.stack([logits.log_softmax(-1) for logits, _ in found], 1)
-        return mixed(weights, forecasts), (weights, forecasts, *(state for _, state in found))
+    def _mix(self, weights: Tensor, outputs: list[tuple[Tensor, State]]) -> tuple[Tensor, State]:
+        forecasts = torch.stack([logits.log_softmax(-1) for logits, _ in outputs], 1)
+        return mixed(weights, forecasts), (weights, forecasts, *(state for _, state in outputs))
 
 
 def start_experts(experts: Sequence[Prior], batch_size: int, context: Tensor | None) -> list[tuple[Tensor, State]]:

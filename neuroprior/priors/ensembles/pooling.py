@@ -97,14 +97,14 @@ class HeldOut:
         powers, best = self.combined(kept)
         since = best  # the least loss since an expert went that had to add more: what the others add is judged by it
         while len(kept) > 1:
-            found = []
+            removals = []
             for out in kept[fixed:]:
                 rest = [number for number in kept if number != out]
                 rest_powers, loss = self.combined(rest)
                 best, since = min(best, loss), min(since, loss)
-                found.append((out, loss, rest, rest_powers))
-            least = {out: best if gains[out] > MIN_GAIN_NATS else since for out, *_ in found}
-            spared = [entry for entry in found if entry[1] <= least[entry[0]] + self.tolerance(gains[entry[0]])]
+                removals.append((out, loss, rest, rest_powers))
+            least = {out: best if gains[out] > MIN_GAIN_NATS else since for out, *_ in removals}
+            spared = [entry for entry in removals if entry[1] <= least[entry[0]] + self.tolerance(gains[entry[0]])]
             if not spared:
                 break
             # The dearest; among those that count, which cost the same, the one that is missed least.
@@ -140,8 +140,8 @@ class HeldOut:
             away = now - first.to(now)
             return float(ridge * (away**2).sum() - taken), (slope + 2 * ridge * away).cpu().numpy()
 
-        found = minimize(loss, first.numpy(), jac=True, method="L-BFGS-B", bounds=[(0, None)] * size)
-        return torch.tensor(found.x, device=forecasts.device)
+        solution = minimize(loss, first.numpy(), jac=True, method="L-BFGS-B", bounds=[(0, None)] * size)
+        return torch.tensor(solution.x, device=forecasts.device)
 
     def loss(self, taken: Tensor) -> float:
         """Nats per action of the Bayesian mixture of forecasts, from those of the actions taken, `[N, L, K]`."""

@@ -68,10 +68,10 @@ def screen(
 
     plans, mask = plans_for(network, learned), held_out.mask()
     steps = planned_steps(plans, Settings(**{"validation": held_out, **settings}))
-    part = max(steps // PARTS, MIN_PART)
-    if steps < 4 * part:
+    trial_steps = max(steps // PARTS, MIN_PART)
+    if steps < 4 * trial_steps:
         return None
-    how = {"validation": held_out, **settings, "max_steps": part}
+    how = {"validation": held_out, **settings, "max_steps": trial_steps}
     losses, trial = [], deepcopy(network)
     generator = torch.Generator().manual_seed(0)
     for _ in range(2):  # the second training goes on from the weights of the first
@@ -80,4 +80,6 @@ def screen(
         losses.append(HeldOut(joined, held_out.actions, mask, joined.shape[2] + 2).combined()[1])
     without = HeldOut(forecasts, held_out.actions, mask, joined.shape[2] + 2)
     loss = without.combined()[1]
-    return Screening(loss - losses[0], loss - losses[1], without.tolerance(NETWORK_GAIN_NATS), log2(steps / (2 * part)))
+    return Screening(
+        loss - losses[0], loss - losses[1], without.tolerance(NETWORK_GAIN_NATS), log2(steps / (2 * trial_steps))
+    )

@@ -100,12 +100,12 @@ class StackedPrior(Prior):
 
     @property
     def config(self) -> dict[str, Any]:
-        own: dict[str, Any] = {"hidden_size": self.hidden_size, "dropout": self.dropout}
-        given = self.mixer.arguments()
-        if given["num_layers"] is not None:
-            own["num_layers"] = given["num_layers"]
-        own |= {"seed": given["seed"]} if given.get("seed") else {}
-        return super().config | own | {"orders": list(self.orders), "depth": self.depth}
+        settings: dict[str, Any] = {"hidden_size": self.hidden_size, "dropout": self.dropout}
+        arguments = self.mixer.arguments()
+        if arguments["num_layers"] is not None:
+            settings["num_layers"] = arguments["num_layers"]
+        settings |= {"seed": arguments["seed"]} if arguments.get("seed") else {}
+        return super().config | settings | {"orders": list(self.orders), "depth": self.depth}
 
     @property
     def learned(self) -> dict[str, Any]:
@@ -120,16 +120,16 @@ class StackedPrior(Prior):
 
     def step(self, action: Tensor, state: Any, context: Tensor | None = None) -> tuple[Tensor, State]:
         self.check_step(action, context)
-        hidden, before, ago, *known = state
+        hidden, before, ago, *last_context = state
         if self.num_contexts is not None:
-            (last,) = known
+            (last,) = last_context
             ago = ago.add(1).clamp_(max=LONG_AGO)
             ago = ago.scatter(1, (last * self.num_actions + action.long())[:, None], 1.0)
             context = last if context is None else context.long()
-        found = [
+        outputs = [
             e.step(action, s, context_for(e, context)) for e, s in zip(self._experts(), before.unbind(1), strict=True)
         ]
-        forecasts, states = zip(*found, strict=True)
+        forecasts, states = zip(*outputs, strict=True)
         logits, hidden = self.mixer.step(action, hidden, self._features(torch.stack(forecasts, 1), ago, context))
         return logits, self._state(hidden, states, ago, context)
 
@@ -169,17 +169,17 @@ class StackedPrior(Prior):
         if len(learned) < FEWEST_UNITS:
             raise ValueError("plans: a stacked prior needs at least two actions to learn from, beside those held out")
         learned = divisible(learned)
-        stacked = self._stacked(learned, self._forecasts(learned, generator))
+        stacked = self._stack(learned, self._forecasts(learned, generator))
         self.recount(plans)
         if held_out is not None:
             with torch.no_grad():
                 forecasts = [e(held_out.actions, context_for(e, held_out.context)) for e in self._experts()]
-            settings = settings | {"validation": self._stacked(held_out, torch.stack(forecasts, 2))}
+            settings = settings | {"validation": self._stack(held_out, torch.stack(forecasts, 2))}
         self.mixer.fit(stacked, generator=generator, **TRAINING | settings)
         self.mixer.window = None  # its hidden state is carried on without limit
         return self
 
-    def _stacked(self, plans: Plans, forecasts: Tensor) -> Plans:
+    def _stack(self, plans: Plans, forecasts: Tensor) -> Plans:
         """The plans as the network reads them, from forecasts `[N, L, E, A]` of their actions."""
         features = self._all_features(forecasts, plans.actions, plans.context)
         return replace(plans, context=features, context_names=None)
@@ -201,10 +201,10 @@ class StackedPrior(Prior):
         out = torch.zeros(shape, device=plans.actions.device)
         with torch.no_grad():
             for learned, left_out in folds(plans, min(PARTS, units), draw_seed(generator)):
-                part = plans[left_out]
+                fold = plans[left_out]
                 for number, expert in enumerate(self._experts()):
                     expert.fit(plans_for(expert, plans[learned]))
-                    out[left_out, :, number] = expert(part.actions, context_for(expert, part.context))
+                    out[left_out, :, number] = expert(fold.actions, context_for(expert, fold.context))
         return out
 
     def _experts(self) -> Iterator[HistoryPrior]:
@@ -215,22 +215,22 @@ class StackedPrior(Prior):
     def _features(self, forecasts: Tensor, ago: Tensor, context: Tensor | None) -> Tensor:
         """The network's features `[N, D]`, from forecasts `[N, E, A]`."""
         if self.num_contexts is None:
-            return self._joined(forecasts, None, None)
+            return self._join_features(forecasts, None, None)
         if context is None:
             raise ValueError("context: this prior takes a context, and none was given")
-        here = context.long()[:, None] * self.num_actions + torch.arange(self.num_actions, device=ago.device)
-        return self._joined(forecasts, ago.gather(1, here), context)
+        entries = context.long()[:, None] * self.num_actions + torch.arange(self.num_actions, device=ago.device)
+        return self._join_features(forecasts, ago.gather(1, entries), context)
 
     def _all_features(self, forecasts: Tensor, plans: Tensor, context: Tensor | None) -> Tensor:
         """The same for whole plans, `[N, L, D]`, of forecasts `[N, L, E, A]`."""
         if context is None or self.num_contexts is None:
-            return self._joined(forecasts, None, None)
+            return self._join_features(forecasts, None, None)
         size = max(MOST_NUMBERS // (self.num_contexts * self.num_actions), 1)
         parts = zip(plans.split(size), context.split(size), strict=True)
-        ago = torch.cat([self._ago(some.long(), theirs.long()) for some, theirs in parts])
-        return self._joined(forecasts, ago, context)
+        ago = torch.cat([self._ago(chunk.long(), theirs.long()) for chunk, theirs in parts])
+        return self._join_features(forecasts, ago, context)
 
-    def _joined(self, forecasts: Tensor, ago: Tensor | None, context: Tensor | None) -> Tensor:
+    def _join_features(self, forecasts: Tensor, ago: Tensor | None, context: Tensor | None) -> Tensor:
         """`[..., D]`: the context, the forecasts `[..., E, A]`, and how long ago each action was taken `[..., A]`."""
         parts = [forecasts.clamp(min=LEAST).flatten(-2)]
         if ago is not None and context is not None:
@@ -239,12 +239,12 @@ class StackedPrior(Prior):
 
     def _ago(self, plans: Tensor, context: Tensor) -> Tensor:
         """`[N, L, A]`: how long ago each action was last taken in the context of each step `[N, L]`."""
-        here = context[..., None] * self.num_actions + torch.arange(self.num_actions, device=plans.device)
+        entries = context[..., None] * self.num_actions + torch.arange(self.num_actions, device=plans.device)
         code = context * self.num_actions + plans
         last = torch.full((len(plans), (self.num_contexts or 0) * self.num_actions), -LONG_AGO, device=plans.device)
         ago = torch.empty(*plans.shape, self.num_actions, device=plans.device)
         for t in range(plans.shape[1]):
-            ago[:, t] = t - last.gather(1, here[:, t])
+            ago[:, t] = t - last.gather(1, entries[:, t])
             last.scatter_(1, code[:, t, None], float(t))
         return ago.clamp_(max=LONG_AGO)
 
@@ -275,9 +275,9 @@ class Mixer(NeuralPrior):
 
     @property
     def config(self) -> dict[str, Any]:
-        own = {"num_experts": self.num_experts, "hidden_size": self.width, "contexts": self.contexts}
-        own |= {"num_layers": self.num_layers}
-        return own | {"num_actions": self.num_actions, "dropout": self.dropout, "seed": 0}
+        arguments = {"num_experts": self.num_experts, "hidden_size": self.width, "contexts": self.contexts}
+        arguments |= {"num_layers": self.num_layers}
+        return arguments | {"num_actions": self.num_actions, "dropout": self.dropout, "seed": 0}
 
     def sizes_for(self, plans: Plans) -> Sizes:
         """As for other networks, but of one layer where the context is known: a second one gains nothing there."""

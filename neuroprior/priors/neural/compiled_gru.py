@@ -23,7 +23,7 @@ def on_one_thread(width: int, num_actions: int) -> bool:
 
 
 def step(
-    given: Tensor,
+    inputs: Tensor,
     rows: Tensor,
     hidden: Tensor,
     before: Tensor,
@@ -33,7 +33,7 @@ def step(
     """Returns the new hidden states `[N, width]` of one layer.
 
     Args:
-        given: `[M, 3 * width]`: what distinct inputs add to the reset gate, the update gate and the new state.
+        inputs: `[M, 3 * width]`: what distinct inputs add to the reset gate, the update gate and the new state.
         rows: int32 `[N]`: which of the inputs each row reads.
         hidden: `[N, 3 * width]`: what the hidden states add, of which the reset gate lets a share into the new state.
         before: `[N, width]`: the hidden states, with contiguous columns.
@@ -45,7 +45,7 @@ def step(
     # rows of the hidden states may have other numbers behind them
     span = max((len(before) - 1) * before.stride(0) + before.shape[1], 0)
     flat = before.as_strided((span,), (1,)).numpy()
-    _step(given.numpy(), rows.numpy(), hidden.numpy(), bias.numpy(), flat, before.stride(0), after.numpy())
+    _step(inputs.numpy(), rows.numpy(), hidden.numpy(), bias.numpy(), flat, before.stride(0), after.numpy())
     return after
 
 
@@ -76,30 +76,31 @@ def sigmoid(x: Any) -> Any:
 
 
 @njit(fastmath=True)
-def cell(reset: Any, update: Any, new: Any, own: Any, last: Any) -> Any:
+def cell(reset: Any, update: Any, new: Any, recurrent: Any, last: Any) -> Any:
     """Returns the gates, the candidate and the new state of one hidden unit (Cho et al. 2014).
 
     Args:
         reset, update: what inputs and hidden states add to the two gates.
         new: what inputs add to the candidate.
-        own: what hidden states add to it, of which the reset gate lets a share through.
+        recurrent: what hidden states add to it, of which the reset gate lets a share through.
         last: the state before.
     """
     reset, update = sigmoid(reset), sigmoid(update)
-    new = tanh(new + reset * own)
+    new = tanh(new + reset * recurrent)
     return reset, update, new, new + update * (last - new)
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def _step(given: Array, rows: Array, hidden: Array, bias: Array, before: Array, stride: int, after: Array) -> None:
+def _step(inputs: Array, rows: Array, hidden: Array, bias: Array, before: Array, stride: int, after: Array) -> None:
     """`before` is flat, of rows at this `stride`."""
     width = after.shape[1]
     for n in range(len(after)):
-        mine, own, last, new = given[rows[n]], hidden[n], before[n * stride : n * stride + width], after[n]
+        mine, recurrent, last, new = inputs[rows[n]], hidden[n], before[n * stride : n * stride + width], after[n]
         for k in range(width):
-            reset = mine[k] + own[k] + bias[k]
-            update = mine[width + k] + own[width + k] + bias[width + k]
-            new[k] = cell(reset, update, mine[2 * width + k], own[2 * width + k] + bias[2 * width + k], last[k])[3]
+            reset = mine[k] + recurrent[k] + bias[k]
+            update = mine[width + k] + recurrent[width + k] + bias[width + k]
+            carried = recurrent[2 * width + k] + bias[2 * width + k]
+            new[k] = cell(reset, update, mine[2 * width + k], carried, last[k])[3]
 
 
 class Network(NamedTuple):
@@ -150,8 +151,8 @@ def advance(network: Network, number: int, states: Array, gates: Array, product:
         for i in range(number):
             for j in range(size):
                 reset, update = gates[i, j] + product[i, j], gates[i, size + j] + product[i, size + j]
-                own = product[i, 2 * size + j] + network.bias[layer, j]
-                states[layer, i, j] = cell(reset, update, gates[i, 2 * size + j], own, states[layer, i, j])[3]
+                recurrent = product[i, 2 * size + j] + network.bias[layer, j]
+                states[layer, i, j] = cell(reset, update, gates[i, 2 * size + j], recurrent, states[layer, i, j])[3]
     np.dot(states[layers - 1][:number], network.head, logits[:number])
     for i in range(number):
         for a in range(actions):
@@ -160,7 +161,7 @@ def advance(network: Network, number: int, states: Array, gates: Array, product:
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def draw_to_the_end(
-    network: Network, given: Array, hidden: Array, line: Array, uniform: Array, temperature: float
+    network: Network, context_gates: Array, hidden: Array, line: Array, uniform: Array, temperature: float
 ) -> None:
     """Draw the actions of N plans, in blocks that stay in the cache.
 
@@ -168,7 +169,7 @@ def draw_to_the_end(
 
     Args:
         network: the network.
-        given: float32 `[N, 3 H]`: what is added to the gates of the first layer at each step; no rows: nothing.
+        context_gates: float32 `[N, 3 H]`: what is added to the gates of the first layer at each step; no rows: nothing.
         hidden: `[N, K, H]`: before the last action is read.
         line: int64 `[N, before + T]`: the actions up to the last one, A + 1 where there was none; gets the drawn ones.
         uniform: float32 `[T, N]`: what they are drawn with.
@@ -192,9 +193,9 @@ def draw_to_the_end(
                 last = line[n, at]
                 for j in range(3 * size):
                     gates[i, j] = network.action[last, j]
-                if len(given):
+                if len(context_gates):
                     for j in range(3 * size):
-                        gates[i, j] += given[n, j]
+                        gates[i, j] += context_gates[n, j]
                 for lag in range(taps):
                     symbol = line[n, at - lag]
                     if symbol != nothing:  # it adds 0
@@ -225,13 +226,13 @@ class Sequence(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, given: Tensor, first: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        """From `given [T, N, 3 * width]`, the state before `first [N, width]`, and the recurrent weights and biases."""
-        length, num, _ = given.shape
-        states = given.new_empty(length + 1, num, first.shape[1])
+    def forward(ctx: Any, inputs: Tensor, first: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """From `inputs [T, N, 3 * width]`, the state before `first [N, width]`, the recurrent weights and biases."""
+        length, num, _ = inputs.shape
+        states = inputs.new_empty(length + 1, num, first.shape[1])
         states[0] = first
-        opened, hidden, turned = torch.empty_like(given), given.new_empty(given.shape), weight.T.contiguous()
-        arrays = given.contiguous().numpy(), hidden.numpy(), states.numpy(), opened.numpy()
+        opened, hidden, turned = torch.empty_like(inputs), inputs.new_empty(inputs.shape), weight.T.contiguous()
+        arrays = inputs.contiguous().numpy(), hidden.numpy(), states.numpy(), opened.numpy()
         for t in range(length):
             torch.addmm(bias, states[t], turned, out=hidden[t])
             _forward(*arrays, t)
@@ -243,43 +244,50 @@ class Sequence(torch.autograd.Function):
     def backward(ctx: Any, after: Tensor) -> tuple[Tensor | None, ...]:
         states, opened, hidden, weight = ctx.saved_tensors
         length, num, width = after.shape
-        to_given, to_hidden = torch.empty_like(opened), torch.empty_like(opened)
+        to_inputs, to_hidden = torch.empty_like(opened), torch.empty_like(opened)
         carried = torch.zeros(num, width)
         arrays = after.contiguous().numpy(), carried.numpy(), states.numpy(), opened.numpy(), hidden.numpy()
-        gradients = to_given.numpy(), to_hidden.numpy()
+        gradients = to_inputs.numpy(), to_hidden.numpy()
         for t in range(length - 1, -1, -1):
             _backward(*arrays, *gradients, t)
             carried.addmm_(to_hidden[t], weight)
         every = to_hidden.flatten(0, 1)
-        return to_given, carried, every.T @ states[:-1].flatten(0, 1), every.sum(0)
+        return to_inputs, carried, every.T @ states[:-1].flatten(0, 1), every.sum(0)
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def _forward(given: Array, hidden: Array, states: Array, opened: Array, t: int) -> None:
+def _forward(inputs: Array, hidden: Array, states: Array, opened: Array, t: int) -> None:
     """Step t: the gates and new states `opened [T, N, 3 * width]`, and the hidden states that follow."""
     width = states.shape[2]
     for n in range(states.shape[1]):
-        mine, own, gate, last, new = given[t, n], hidden[t, n], opened[t, n], states[t, n], states[t + 1, n]
+        mine, recurrent, gate, last, new = inputs[t, n], hidden[t, n], opened[t, n], states[t, n], states[t + 1, n]
         for k in range(width):
-            reset, update = mine[k] + own[k], mine[width + k] + own[width + k]
-            reset, update, fresh, after = cell(reset, update, mine[2 * width + k], own[2 * width + k], last[k])
+            reset, update = mine[k] + recurrent[k], mine[width + k] + recurrent[width + k]
+            reset, update, fresh, after = cell(reset, update, mine[2 * width + k], recurrent[2 * width + k], last[k])
             gate[k], gate[width + k], gate[2 * width + k], new[k] = reset, update, fresh, after
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 def _backward(
-    after: Array, carried: Array, states: Array, opened: Array, hidden: Array, to_given: Array, to_hidden: Array, t: int
+    after: Array,
+    carried: Array,
+    states: Array,
+    opened: Array,
+    hidden: Array,
+    to_inputs: Array,
+    to_hidden: Array,
+    t: int,
 ) -> None:
     """Step t: gradients of what the inputs and the hidden states add; `carried` becomes the direct one of the state."""
     width, one = states.shape[2], float32(1)
     for n in range(states.shape[1]):
-        gate, own, last, down, back = opened[t, n], hidden[t, n], states[t, n], to_given[t, n], to_hidden[t, n]
+        gate, recurrent, last, down, back = opened[t, n], hidden[t, n], states[t, n], to_inputs[t, n], to_hidden[t, n]
         out, past = after[t, n], carried[n]
         for k in range(width):
             reset, update, fresh = gate[k], gate[width + k], gate[2 * width + k]
             total = out[k] + past[k]
             new = total * (one - update) * (one - fresh * fresh)
-            opens = new * own[2 * width + k] * reset * (one - reset)
+            opens = new * recurrent[2 * width + k] * reset * (one - reset)
             keeps = total * (last[k] - fresh) * update * (one - update)
             down[k], down[width + k], down[2 * width + k] = opens, keeps, new
             back[k], back[width + k], back[2 * width + k] = opens, keeps, new * reset

@@ -55,9 +55,9 @@ class GRUPrior(NeuralPrior):
         seed: int = 0,
     ) -> None:
         sizes = {"num_layers": num_layers, "hidden_size": hidden_size}
-        given = {name: size for name, size in sizes.items() if size is not None}
-        check_sizes(**given)
-        check_memory(24 * given.get("hidden_size", 1) ** 2, **given)
+        chosen = {name: size for name, size in sizes.items() if size is not None}
+        check_sizes(**chosen)
+        check_memory(24 * chosen.get("hidden_size", 1) ** 2, **chosen)
         super().__init__(num_actions, hidden_size, window, lags, dropout, num_contexts, context_size, seed, num_layers)
 
     @property
@@ -67,8 +67,8 @@ class GRUPrior(NeuralPrior):
 
     @property
     def config(self) -> dict[str, Any]:
-        given = self.arguments()
-        return super().config | {"hidden_size": given.pop("width")} | given
+        arguments = self.arguments()
+        return super().config | {"hidden_size": arguments.pop("width")} | arguments
 
     def build(self) -> None:
         width = self.hidden_size
@@ -107,8 +107,8 @@ class GRUPrior(NeuralPrior):
             context: `[K]` or `[K, C]`: that of the next action, with each.
             row: integers `[N]`: which of the K each plan gets.
         """
-        own = type(self).encode is GRUPrior.encode and type(self).step is NeuralPrior.step
-        if not own or self.lags > 1 or self.window == 0 or not self._may_step(action[:, None]):
+        unchanged = type(self).encode is GRUPrior.encode and type(self).step is NeuralPrior.step
+        if not unchanged or self.lags > 1 or self.window == 0 or not self._may_step(action[:, None]):
             return self.step(action[row], state, context[row])
         vectors, _ = self.embedding(action.long()[:, None], context[:, None], None, self.window)
         layers, recent = state[1]
@@ -147,10 +147,10 @@ class GRUPrior(NeuralPrior):
 
         if not compiled_gru.on_one_thread(size, kinds):
             return None
-        given = layers.new_empty(0, 3 * size) if context is None else self.context_gates(context)
+        context_gates = layers.new_empty(0, 3 * size) if context is None else self.context_gates(context)
         line = torch.cat([recent, action.long()[:, None], recent.new_empty(number, steps)], 1)
         # The loop overwrites the hidden states.
-        arrays: Any = (x.detach().contiguous().numpy() for x in (given, layers.clone(), line, uniform))
+        arrays: Any = (x.detach().contiguous().numpy() for x in (context_gates, layers.clone(), line, uniform))
         draw: Any = compiled_gru.draw_to_the_end
         draw(compiled_gru.Network(*self.arrays()), *arrays, float(temperature))
         return line[:, self.lags :]
@@ -167,14 +167,18 @@ class GRUPrior(NeuralPrior):
     def arrays(self) -> tuple[Any, ...]:
         """The parts of `neuroprior.priors.neural.compiled_gru.Network`: weights, and what actions add to the gates."""
         size, embedding = self.hidden_size, self.embedding
-        inputs, recurrent, biases, own = (torch.stack(part) for part in zip(*self.gru.all_weights, strict=True))
+        inputs, recurrent, biases, recurrent_biases = (
+            torch.stack(weights) for weights in zip(*self.gru.all_weights, strict=True)
+        )
         # The last part of a layer's own biases is left: the reset gate lets a share of it into the new state.
-        biases = biases + torch.cat([own[:, : 2 * size], torch.zeros_like(own[:, 2 * size :])], 1)
+        biases = biases + torch.cat(
+            [recurrent_biases[:, : 2 * size], torch.zeros_like(recurrent_biases[:, 2 * size :])], 1
+        )
         past, beyond = embedding.of_past(self.window)
         first, above = inputs[0].T, inputs[1:].mT
         parts = (
             embedding.action.weight @ first + biases[0], past @ first, beyond @ first,
-            recurrent.mT, own[:, 2 * size :], above, biases[1:], self.head.weight.T, self.head.bias,
+            recurrent.mT, recurrent_biases[:, 2 * size :], above, biases[1:], self.head.weight.T, self.head.bias,
         )  # fmt: skip
         return tuple(x.detach().float().contiguous().numpy() for x in parts)
 
@@ -242,20 +246,20 @@ def gru_step(gru: nn.GRU, below: Tensor, layers: Tensor, rows: Tensor | None = N
     return below, after[0][None] if len(after) == 1 else torch.stack(after)
 
 
-def _step_in_parts(given: Tensor, rows: Tensor, before: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+def _step_in_parts(inputs: Tensor, rows: Tensor, before: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """The new hidden states of one layer, where products of `ROWS` rows stay in the cache; threads share many."""
     from neuroprior.priors.neural.compiled_gru import step
 
     before = before if before.stride(1) == 1 else before.contiguous()
     if len(before) <= ROWS:
-        return step(given, rows, before @ weight.T, before, bias)
+        return step(inputs, rows, before @ weight.T, before, bias)
     after = before.new_empty(before.shape)
 
-    def part(begin: int) -> None:
-        some = slice(begin, begin + ROWS)
-        step(given, rows[some], before[some] @ weight.T, before[some], bias, after[some])
+    def step_chunk(begin: int) -> None:
+        chunk = slice(begin, begin + ROWS)
+        step(inputs, rows[chunk], before[chunk] @ weight.T, before[chunk], bias, after[chunk])
 
     begins = range(0, len(before), ROWS)
     with one_thread(len(begins) < WORTH_THREADS):
-        share(part, begins)
+        share(step_chunk, begins)
     return after

@@ -133,14 +133,15 @@ class NeuralPrior(Prior):
         check_seed(seed)
         self._given_window = self.window = window
         check_sizes(lags=1 if lags is None else lags)
-        self._given = (width, lags, dropout, num_layers)
+        self._fixed_sizes = (width, lags, dropout, num_layers)
         self._seed, self.sized = seed, False
         self._make(Sizes())
 
     def _make(self, sizes: Sizes) -> None:
         """Make the layers, with the sizes that were given and these where none were."""
-        made = [own if own is not None else size for own, size in zip(self._given, sizes, strict=True)]
-        self.width, self.lags, self.dropout, self.num_layers = int(made[0]), int(made[1]), float(made[2]), int(made[3])
+        pairs = zip(self._fixed_sizes, sizes, strict=True)
+        width, lags, dropout, num_layers = (size if fixed is None else fixed for fixed, size in pairs)
+        self.width, self.lags, self.dropout, self.num_layers = int(width), int(lags), float(dropout), int(num_layers)
         check_layers(self.num_layers, 24 * self.width**2)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self._seed)
@@ -156,7 +157,7 @@ class NeuralPrior(Prior):
         """The sizes, by name; before it learns, which chooses what was not given, as they were given, and the seed."""
         if self.sized:
             return {name: getattr(self, name) for name in Sizes._fields}
-        return dict(zip(Sizes._fields, self._given, strict=True)) | {"seed": self._seed}
+        return dict(zip(Sizes._fields, self._fixed_sizes, strict=True)) | {"seed": self._seed}
 
     @property
     def learned(self) -> dict[str, Any]:
@@ -172,7 +173,7 @@ class NeuralPrior(Prior):
         sizes = learned.get("sizes")
         if sizes is not None:
             self.sized = True  # to `fit` again goes on from the weights that are loaded next
-            if None in self._given:
+            if None in self._fixed_sizes:
                 self._make(Sizes(*sizes))
 
     def sizes_for(self, plans: Plans) -> Sizes:
@@ -229,28 +230,28 @@ class NeuralPrior(Prior):
     def _read(self, previous: Tensor, context: Tensor | None, hidden: State | None) -> tuple[Tensor, State]:
         """Logits `[N, A]` after actions `previous [N]`, and the prior's state."""
         context = None if context is None else as_single(context.detach())
-        given = None if context is None else context[:, None]
-        logits, hidden = self.encode(self._shown(previous)[:, None], given, hidden)
+        step_context = None if context is None else context[:, None]
+        logits, hidden = self.encode(self._visible_actions(previous)[:, None], step_context, hidden)
         return logits[:, 0], (context, hidden) if self.takes_context else hidden
 
-    def _shown(self, previous: Tensor) -> Tensor:
+    def _visible_actions(self, previous: Tensor) -> Tensor:
         """The actions before steps `[...]` as the network is shown them: with a window of 0, none."""
         return torch.full_like(previous, self.num_actions) if self.window == 0 else previous
 
     @property
     def is_plain(self) -> bool:
         """Whether it is of a class of this library, reads past actions, and has no hooks."""
-        own = type(self).__module__.startswith(f"{__package__}.")
-        hooks = (part._forward_hooks or part._forward_pre_hooks for part in self.modules())
-        return own and self.window != 0 and not any(hooks)
+        from_library = type(self).__module__.startswith(f"{__package__}.")
+        hooks = (module._forward_hooks or module._forward_pre_hooks for module in self.modules())
+        return from_library and self.window != 0 and not any(hooks)
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         if plans.shape[1] == 0:
             return torch.zeros(*plans.shape, self.num_actions, device=self.device)
         previous = self._previous(plans, None)
         if self.window == 0:  # each action is the first of a plan
-            given = None if context is None else context.flatten(0, 1)[:, None]
-            return self.encode(previous.flatten()[:, None], given)[0].view(*plans.shape, self.num_actions)
+            flat_context = None if context is None else context.flatten(0, 1)[:, None]
+            return self.encode(previous.flatten()[:, None], flat_context)[0].view(*plans.shape, self.num_actions)
         return self.encode(previous, context)[0]
 
     def forward_from(
@@ -278,7 +279,7 @@ class NeuralPrior(Prior):
         shifted = nn.functional.pad(plans.long(), (1, 0), value=self.num_actions)[:, :-1]
         if first is not None:
             shifted = torch.cat([first[:, None].long(), shifted[:, 1:]], 1)
-        return self._shown(shifted)
+        return self._visible_actions(shifted)
 
     @property
     def fit_settings(self) -> tuple[str, ...]:
@@ -320,7 +321,7 @@ class NeuralPrior(Prior):
         """
         plans = training_plans(self, plans, further=self.sized)
         plans = plans[plans.mask().any(1)]
-        if None in self._given and not self.sized:
+        if None in self._fixed_sizes and not self.sized:
             self._make(self.sizes_for(plans))
         for module in () if self.sized else self.modules():
             if isinstance(module, Standardise):
@@ -345,9 +346,9 @@ def training_settings() -> tuple[str, ...]:
 
 def context_embedding(num_contexts: int, width: int) -> nn.Embedding:
     """An embedding of contexts that is initialised close to 0, so that contexts differ only where plans show it."""
-    made = nn.Embedding(num_contexts, width)
-    nn.init.normal_(made.weight, std=CONTEXT_SPREAD)
-    return made
+    embedding = nn.Embedding(num_contexts, width)
+    nn.init.normal_(embedding.weight, std=CONTEXT_SPREAD)
+    return embedding
 
 
 class Embedding(nn.Module):
@@ -408,12 +409,12 @@ class Embedding(nn.Module):
     def of_context(self, context: Tensor) -> Tensor:
         """What contexts `[N, T]` or `[N, T, C]` add to the vectors: `[N, T, width]`."""
         if self.index is not None:
-            given: Tensor = self.index(context.long())
+            vectors: Tensor = self.index(context.long())
         else:
             assert self.features is not None
             assert self.scale is not None
-            given = self.features(self.scale(context.to(self.features.weight.dtype)))
-        return given
+            vectors = self.features(self.scale(context.to(self.features.weight.dtype)))
+        return vectors
 
     def of_past(self, window: int | None) -> tuple[Tensor, Tensor]:
         """What the last actions add to the vectors; see `forward`.

@@ -43,11 +43,11 @@ def predict(initial: Tensor, steps: Tensor, likelihood: Tensor) -> tuple[Tensor,
     """
     from neuroprior.priors.switching.compiled_smoothing import filter_modes
 
-    given = [values.detach().double().cpu().contiguous() for values in (initial, steps, likelihood)]
-    predicted, filtered = torch.empty_like(given[2]), torch.empty_like(given[2])
-    totals = given[2].new_empty(given[2].shape[:2])
+    inputs = [values.detach().double().cpu().contiguous() for values in (initial, steps, likelihood)]
+    predicted, filtered = torch.empty_like(inputs[2]), torch.empty_like(inputs[2])
+    totals = inputs[2].new_empty(inputs[2].shape[:2])
     run: Any = filter_modes
-    run(*_arrays(*given), TINY, *_arrays(predicted, filtered, totals))
+    run(*_arrays(*inputs), TINY, *_arrays(predicted, filtered, totals))
     return predicted.to(likelihood), filtered.to(likelihood), totals.log().to(likelihood)
 
 
@@ -57,10 +57,10 @@ def smooth(initial: Tensor, steps: Tensor, likelihood: Tensor) -> Smoothed:
 
     _, filtered, log_likelihood = predict(initial, steps, likelihood)
     num, length, modes = likelihood.shape
-    given = [values.detach().double().cpu().contiguous() for values in (steps, likelihood, filtered)]
-    smoothed, moved = torch.empty_like(given[2]), given[2].new_empty(num, max(length - 1, 0), modes, modes)
+    inputs = [values.detach().double().cpu().contiguous() for values in (steps, likelihood, filtered)]
+    smoothed, moved = torch.empty_like(inputs[2]), inputs[2].new_empty(num, max(length - 1, 0), modes, modes)
     run: Any = smooth_modes
-    run(*_arrays(*given[:2]), TINY, *_arrays(given[2], smoothed, moved))
+    run(*_arrays(*inputs[:2]), TINY, *_arrays(inputs[2], smoothed, moved))
     return Smoothed(log_likelihood, filtered, smoothed.to(likelihood), moved.to(likelihood))
 
 

@@ -30,7 +30,7 @@ class ModeChains:
         self.parent = parent_rows(tree, counts, self.contexts)
         self.kinds = torch.bincount(counts.row, minlength=len(counts.row_code)).double()
         self.code = counts.row * num_actions + counts.action
-        self._known: dict[int, list[_Block]] = {}
+        self._cached_blocks: dict[int, list[_Block]] = {}
         ends = torch.tensor(level_bounds(tree, counts, self.contexts), device=counts.row.device)
         levels = torch.searchsorted(counts.row, ends).tolist()
         # Of the entries of each level but the first, the longest histories first, those of their shorter histories.
@@ -57,16 +57,16 @@ class ModeChains:
             expected: `[P, K]`, counts after all histories, as `totals` returns them.
         """
         modes, number = expected.shape[1], len(self.counts.row_code)
-        own = expected.new_empty(number + 1, modes, self.num_actions)
-        whole = own[:, 0].clone()  # of all modes together
-        own[-1], whole[-1] = self._everywhere(expected)
+        probs = expected.new_empty(number + 1, modes, self.num_actions)
+        whole = probs[:, 0].clone()  # of all modes together
+        probs[-1], whole[-1] = self._everywhere(expected)
         for block in self._blocks(modes):
-            here, above = block.rows, block.above
+            rows, above = block.rows, block.above
             n = _dense(expected, block.entries, block.row, block.action, block.size)
-            whole[here] = self._blend(n.sum(1), whole[above], block.kinds)
-            base = (1 - block.share) * own[above] + block.share * whole[here, None]
-            own[here] = self._blend(n, base, block.kinds[:, None])
-        return own.clamp(min=1e-300).log()
+            whole[rows] = self._blend(n.sum(1), whole[above], block.kinds)
+            base = (1 - block.share) * probs[above] + block.share * whole[rows, None]
+            probs[rows] = self._blend(n, base, block.kinds[:, None])
+        return probs.clamp(min=1e-300).log()
 
     def entry_log_probs(self, expected: Tensor) -> Tensor:
         """Of `log_probs` the P entries alone, `[P, K]`: those of the actions that occurred after each history.
@@ -76,34 +76,34 @@ class ModeChains:
         row, action, n = self.counts.row, self.counts.action, expected.clamp(min=0)
         total = n.new_zeros(len(self.kinds), n.shape[1]).index_add_(0, row, n)[row]
         kinds = self.kinds[row, None]
-        own, whole = self._everywhere(expected)
-        own, whole = own[:, action].T.contiguous(), whole[action][:, None]
+        probs, whole = self._everywhere(expected)
+        probs, whole = probs[:, action].T.contiguous(), whole[action][:, None]
         for first, until, above in [(0, self.above[-1][0] if self.above else len(n), None), *reversed(self.above)]:
-            here = slice(first, until)
-            over, share = (here, 1.0) if above is None else (above, self.sharing)
-            every = n[here].sum(1, keepdim=True), total[here].sum(1, keepdim=True)
-            whole[here] = self._interpolate(*every, whole[over], kinds[here])
-            base = (1 - share) * own[over] + share * whole[here]
-            own[here] = self._interpolate(n[here], total[here], base, kinds[here])
-        return own.clamp(min=1e-300).log()
+            span = slice(first, until)
+            over, share = (span, 1.0) if above is None else (above, self.sharing)
+            every = n[span].sum(1, keepdim=True), total[span].sum(1, keepdim=True)
+            whole[span] = self._interpolate(*every, whole[over], kinds[span])
+            base = (1 - share) * probs[over] + share * whole[span]
+            probs[span] = self._interpolate(n[span], total[span], base, kinds[span])
+        return probs.clamp(min=1e-300).log()
 
     def _everywhere(self, expected: Tensor) -> tuple[Tensor, Tensor]:
         """The probabilities `[K, A]` in contexts without counts, and those of all modes together, `[A]`."""
         counts, modes = self.counts, expected.shape[1]
-        own = expected.new_full((modes, self.num_actions), 1 / self.num_actions)
-        whole = own[0]
+        probs = expected.new_full((modes, self.num_actions), 1 / self.num_actions)
+        whole = probs[0]
         if self.pooled:
             until = int(torch.searchsorted(counts.row_code, self.contexts))
             first = _dense(expected, *self._entries(0, until), (until, self.num_actions)).sum(0)
             kinds = (first.sum(0) > 0).sum()[None]
             whole = self._blend(first.sum(0), whole, kinds)
-            own = self._blend(first, whole.expand(modes, -1), kinds)
-        return own, whole
+            probs = self._blend(first, whole.expand(modes, -1), kinds)
+        return probs, whole
 
     def _blocks(self, modes: int) -> list["_Block"]:
         """The blocks of rows for a number of modes; found once, as EM goes through them in each iteration."""
-        if modes not in self._known:
-            number, found = len(self.counts.row_code), []
+        if modes not in self._cached_blocks:
+            number, blocks = len(self.counts.row_code), []
             for _, first, until in row_blocks(self.tree, self.counts, self.contexts, self.num_actions * modes):
                 above = self.parent[first:until]
                 # With nothing but the place to go by, what all modes do there says more than what the mode does
@@ -112,9 +112,9 @@ class ModeChains:
                 entries, row, action = self._entries(first, until)
                 kinds = self.kinds[first:until, None]
                 size = until - first, self.num_actions
-                found.append(_Block(slice(first, until), entries, row, action, size, above, share, kinds))
-            self._known[modes] = found
-        return self._known[modes]
+                blocks.append(_Block(slice(first, until), entries, row, action, size, above, share, kinds))
+            self._cached_blocks[modes] = blocks
+        return self._cached_blocks[modes]
 
     def _blend(self, n: Tensor, base: Tensor, kinds: Tensor) -> Tensor:
         """Probabilities `[..., A]` from counts and what they are interpolated with; `kinds [..., 1]` of actions."""

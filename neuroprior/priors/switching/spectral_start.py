@@ -55,7 +55,7 @@ def spectral_modes(plans: Plans, num_modes: int, length: float, generator: torch
         """The sums of `values [T, D]` over the nearby actions of the same plan, without the action itself."""
         whole = values.new_zeros(*mask.shape, values.shape[1])
         whole[mask] = values
-        sums = _decaying(whole.numpy(), length) + _decaying(whole.numpy()[:, ::-1], length)[:, ::-1]
+        sums = _decaying_sums(whole.numpy(), length) + _decaying_sums(whole.numpy()[:, ::-1], length)[:, ::-1]
         return torch.from_numpy(np.ascontiguousarray(sums))[mask]
 
     def project(directions: Tensor) -> Tensor:
@@ -65,8 +65,8 @@ def spectral_modes(plans: Plans, num_modes: int, length: float, generator: torch
     def moments(direction: Any) -> Any:
         """The matrix of cross-moments times a direction."""
         nearby = near(project(torch.from_numpy(np.ascontiguousarray(direction)).view(-1, 1)))
-        found = torch.zeros(number, size, dtype=torch.double).index_add_(0, rows, deviations * nearby)
-        return found.flatten().numpy()
+        product = torch.zeros(number, size, dtype=torch.double).index_add_(0, rows, deviations * nearby)
+        return product.flatten().numpy()
 
     operator = LinearOperator((number * size,) * 2, matvec=moments, dtype=np.float64)
     first = torch.rand(number * size, generator=generator, device=generator.device).double().cpu().numpy()
@@ -74,19 +74,21 @@ def spectral_modes(plans: Plans, num_modes: int, length: float, generator: torch
         _, directions = eigsh(operator, k=num_modes - 1, which="LA", v0=first, tol=1e-3)
     except ArpackError:
         return None
-    own = project(torch.from_numpy(np.ascontiguousarray(directions)))
-    points = (own + near(own)).numpy()
+    projected = project(torch.from_numpy(np.ascontiguousarray(directions)))
+    points = (projected + near(projected)).numpy()
     points = points / points.std(0).clip(1e-12)
-    some = points[:: -(-len(points) // MOST_POINTS)]
+    sample = points[:: -(-len(points) // MOST_POINTS)]
     draw = np.random.default_rng(int(torch.randint(2**31, (), generator=generator, device=generator.device)))
-    found = [kmeans2(some, num_modes, minit="++", seed=draw) for _ in range(TRIES)]
-    centres = min((centre for centre, _ in found), key=lambda centre: float(np.square(vq(some, centre)[1]).sum()))
+    clusterings = [kmeans2(sample, num_modes, minit="++", seed=draw) for _ in range(TRIES)]
+    centres = min(
+        (centre for centre, _ in clusterings), key=lambda centre: float(np.square(vq(sample, centre)[1]).sum())
+    )
     modes = torch.zeros(mask.shape, dtype=torch.int64)
     modes[mask] = torch.from_numpy(vq(points, centres)[0]).long()
     return modes
 
 
-def _decaying(values: Any, length: float) -> Any:
+def _decaying_sums(values: Any, length: float) -> Any:
     """Sums of `values [N, L, D]` over what came before, decaying over `length` steps."""
     from scipy.signal import lfilter
 

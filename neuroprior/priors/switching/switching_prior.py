@@ -195,12 +195,12 @@ class SwitchingPrior(HistoryPrior):
 
     def _forecast(self, modes: Tensor, node: Tensor, context: Tensor) -> tuple[Tensor, State]:
         """The logits, and the state: the modes before the action `[N, K * D]`, and where the chain is, int64 `[N]`."""
-        logits = self._mixed(modes, self.log_probs[self._row(node, context)])
+        logits = self._mix(modes, self.log_probs[self._row(node, context)])
         return logits, (modes, node * (self.num_contexts or 1) + context)
 
-    def _mixed(self, modes: Tensor, log_probs: Tensor) -> Tensor:
+    def _mix(self, modes: Tensor, log_probs: Tensor) -> Tensor:
         """Logits `[..., A]` of modes `[..., K * D]` with their actions' log-probabilities `[..., K, A]`."""
-        weights = self._summed(modes).clamp(min=TINY).log()
+        weights = self._sum_phases(modes).clamp(min=TINY).log()
         return (weights[..., None] + log_probs).logsumexp(-2).float()
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
@@ -210,7 +210,7 @@ class SwitchingPrior(HistoryPrior):
         rows, cells = self.cells(plans, context)
         log_probs = self.log_probs[rows]
         before, _, _ = predict(self.first, self._steps(cells), self._likelihood(taken_of(log_probs, plans)))
-        return self._mixed(before, log_probs)
+        return self._mix(before, log_probs)
 
     def cells(self, plans: Tensor, context: Tensor | None) -> tuple[Tensor, Tensor]:
         """Of each action of `plans [N, L]` the row of `log_probs` and that of `transitions` which hold for it."""
@@ -291,7 +291,7 @@ class SwitchingPrior(HistoryPrior):
             # Short histories leave more to the modes: those found with them are often better to start from.
             lower = SwitchingPrior(**self.config | {"order": self.order // 2}).to(self.device)
             starts.append(
-                learner.from_posteriors(lower.fit(plans_for(lower, plans), generator=generator)._known(plans))
+                learner.from_posteriors(lower.fit(plans_for(lower, plans), generator=generator)._posteriors(plans))
             )
         short = min(SHORT_RUN, self.max_iterations)
         modes = max((learner.run(start, short) for start in starts), key=lambda run: run[1])[0]
@@ -301,17 +301,17 @@ class SwitchingPrior(HistoryPrior):
 
     def recount(self, plans: Plans) -> Self:
         """Learn from `plans` what the modes do, beginning with the modes that are known."""
-        generator, known = torch.Generator(self.device).manual_seed(0), bool(len(self.row_code))
-        if not known:
+        generator, has_modes = torch.Generator(self.device).manual_seed(0), bool(len(self.row_code))
+        if not has_modes:
             return self.fit(plans, generator=generator)
         return self._go_on(counted_plans(self, plans), generator, SHORT_RUN)
 
     @torch.no_grad()
     def _go_on(self, plans: Plans, generator: torch.Generator, iterations: int) -> Self:
         if iterations:
-            known = self._known(plans)
+            posteriors = self._posteriors(plans)
             learner = _Learner(self, plans, generator)
-            learner.take(learner.run(learner.from_posteriors(known), iterations - 1)[0])
+            learner.take(learner.run(learner.from_posteriors(posteriors), iterations - 1)[0])
         return self
 
     @torch.no_grad()
@@ -329,14 +329,16 @@ class SwitchingPrior(HistoryPrior):
         if plans.actions.numel() == 0:
             none = self.first.new_zeros(*plans.actions.shape, self.num_modes)
             return ModePosterior(none, none, none[..., 0].long(), none.new_zeros(len(plans), *[self.num_modes] * 2))
-        found = []
+        posteriors = []
         for indices, steps, likelihood in self._in_parts(plans):
             path = most_probable_path(self.first, steps, likelihood).div(self.phases, rounding_mode="floor")
             modes = smooth(self.first, steps, likelihood)
             within = plans[indices].mask()[:, 1:, None, None]
-            moves = self._summed(self._summed((modes.moved * within).sum(1)).mT).mT
-            found.append(ModePosterior(self._summed(modes.filtered), self._summed(modes.smoothed), path, moves))
-        return ModePosterior(*(torch.cat(some) for some in zip(*found, strict=True)))
+            moves = self._sum_phases(self._sum_phases((modes.moved * within).sum(1)).mT).mT
+            posteriors.append(
+                ModePosterior(self._sum_phases(modes.filtered), self._sum_phases(modes.smoothed), path, moves)
+            )
+        return ModePosterior(*(torch.cat(chunks) for chunks in zip(*posteriors, strict=True)))
 
     def beginning_in(self, mode: int, keep: bool = False) -> "SwitchingPrior":
         """This prior where the first mode is known; what it learned is shared, not copied.
@@ -353,12 +355,12 @@ class SwitchingPrior(HistoryPrior):
         phases = self.first.view(self.num_modes, self.phases)[mode]
         first = torch.zeros_like(self.first).view(self.num_modes, self.phases)
         first[mode] = phases / phases.sum() if phases.sum() > 0 else 1 / self.phases
-        made = copy(self)
-        made._buffers = self._buffers | {"first": first.flatten()}
+        prior = copy(self)
+        prior._buffers = self._buffers | {"first": first.flatten()}
         if keep:
-            made.switching = "constant"
-            made.transitions = torch.eye(self.num_modes, dtype=first.dtype, device=self.device)[None]
-        return made
+            prior.switching = "constant"
+            prior.transitions = torch.eye(self.num_modes, dtype=first.dtype, device=self.device)[None]
+        return prior
 
     @property
     def _num_cells(self) -> int:
@@ -370,21 +372,21 @@ class SwitchingPrior(HistoryPrior):
         """Numbers that inference holds for an action."""
         return (self.num_modes * self.phases) ** 2
 
-    def _summed(self, values: Tensor) -> Tensor:
+    def _sum_phases(self, values: Tensor) -> Tensor:
         """Sums over the phases of modes: `[..., K * D]` to `[..., K]`."""
         summed: Tensor = values.unflatten(-1, (self.num_modes, self.phases)).sum(-1)
         return summed
 
-    def _known(self, plans: Plans) -> list[tuple[Tensor, Smoothed]]:
+    def _posteriors(self, plans: Plans) -> list[tuple[Tensor, Smoothed]]:
         """What is known about the modes of plans: indices of some, and of these."""
         return [(indices, smooth(self.first, *inputs)) for indices, *inputs in self._in_parts(plans)]
 
     def _in_parts(self, plans: Plans) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Indices of plans that are inferred together, and the `steps` and the `likelihood` of inference in them."""
         for indices in _parts(plans, self._elements):
-            part = plans[indices]
-            rows, cells = self.cells(part.actions, part.context)
-            yield indices, *self._inputs(part, cells, taken_of(self.log_probs[rows], part.actions))
+            chunk = plans[indices]
+            rows, cells = self.cells(chunk.actions, chunk.context)
+            yield indices, *self._inputs(chunk, cells, taken_of(self.log_probs[rows], chunk.actions))
 
     def _inputs(self, plans: Plans, cells: Tensor, taken: Tensor) -> tuple[Tensor, Tensor]:
         """The `steps` and the `likelihood` of inference in plans, from the log-probabilities of their actions."""
@@ -408,7 +410,7 @@ class SwitchingPrior(HistoryPrior):
         return fit
 
 
-class _Part(NamedTuple):
+class _Chunk(NamedTuple):
     """Plans of one fold that are inferred together, with the cell and the entry of each action, `[n, L]`."""
 
     fold: int
@@ -429,14 +431,14 @@ class _Learner:
         self.chains = ModeChains(tree, counts, prior.num_contexts, prior.num_actions, prior.smoothing, prior.sharing)
         fold = _folds(plans, prior.folds, generator)
         self.folds = int(fold.max()) + 1 if len(fold) else 1
-        self.parts, self.count = [], max(int(plans.mask().sum()), 1)
+        self.chunks, self.count = [], max(int(plans.mask().sum()), 1)
         for number in range(self.folds):
             for indices in _parts(plans, prior._elements, fold == number):
-                part = plans[indices]
-                rows, cells = prior.cells(part.actions, part.context)
-                entries = self.chains.entries(rows.flatten(), part.actions.long().flatten()).view(rows.shape)
-                mask = None if bool(part.mask().all()) else part.mask()
-                self.parts.append(_Part(number, mask, part, cells, entries, indices))
+                chunk = plans[indices]
+                rows, cells = prior.cells(chunk.actions, chunk.context)
+                entries = self.chains.entries(rows.flatten(), chunk.actions.long().flatten()).view(rows.shape)
+                mask = None if bool(chunk.mask().all()) else chunk.mask()
+                self.chunks.append(_Chunk(number, mask, chunk, cells, entries, indices))
 
     def random_start(self, generator: torch.Generator) -> Modes:
         """Modes in random segments."""
@@ -460,22 +462,22 @@ class _Learner:
     def _from_segments(self, smoothed: Tensor) -> Modes:
         """Modes that begin as often, each for a segment; from those of all actions, `[N, L, K * D]`."""
         size, modes = self.prior.num_modes * self.prior.phases, self._empty()
-        for part in self.parts:
-            self._count(modes, part, smoothed[part.indices])
+        for chunk in self.chunks:
+            self._count(modes, chunk, smoothed[chunk.indices])
         transitions = modes.transitions + 1 / SEGMENT / max(self.prior.num_modes - 1, 1)
         transitions.diagonal(dim1=1, dim2=2).fill_(1 - 1 / SEGMENT if self.prior.num_modes > 1 else 1.0)
         return Modes(torch.full_like(modes.first, 1 / size), transitions, modes.expected)
 
-    def from_posteriors(self, known: list[tuple[Tensor, Smoothed]]) -> Modes:
+    def from_posteriors(self, posteriors: list[tuple[Tensor, Smoothed]]) -> Modes:
         """Modes from what is known about those of all plans."""
         modes, totals = self._empty(), self._no_moves()
-        every = torch.cat([indices for indices, _ in known]).argsort()
-        smoothed = torch.cat([found.smoothed for _, found in known])[every]
-        moved = torch.cat([found.moved for _, found in known])[every]
-        for part in self.parts:
-            self._count(modes, part, smoothed[part.indices])
-            self._count_moves(totals, part, moved[part.indices])
-        return self._maximised(modes, totals)
+        every = torch.cat([indices for indices, _ in posteriors]).argsort()
+        smoothed = torch.cat([posterior.smoothed for _, posterior in posteriors])[every]
+        moved = torch.cat([posterior.moved for _, posterior in posteriors])[every]
+        for chunk in self.chunks:
+            self._count(modes, chunk, smoothed[chunk.indices])
+            self._count_moves(totals, chunk, moved[chunk.indices])
+        return self._maximise(modes, totals)
 
     def run(self, modes: Modes, iterations: int) -> tuple[Modes, float]:
         """Iterate EM; returns the modes, and the log-likelihood per action before the last iteration."""
@@ -489,19 +491,19 @@ class _Learner:
 
     def _iterate(self, modes: Modes) -> tuple[Modes, float]:
         """Infer the modes of each fold with what the others say, and count anew."""
-        prior, found, totals, log_likelihood = self.prior, self._empty(), self._no_moves(), 0.0
+        prior, new_modes, totals, log_likelihood = self.prior, self._empty(), self._no_moves(), 0.0
         prior.first, prior.transitions = modes.first, modes.transitions
         whole, fold = modes.expected.sum(0), -1
-        for part in self.parts:
-            if part.fold != fold:
-                fold = part.fold
+        for chunk in self.chunks:
+            if chunk.fold != fold:
+                fold = chunk.fold
                 others = whole if self.folds == 1 else whole - modes.expected[fold]
                 log_probs = self.chains.entry_log_probs(self.chains.totals(others))
-            inferred = smooth(prior.first, *prior._inputs(part.plans, part.cells, log_probs[part.entries]))
-            self._count(found, part, inferred.smoothed)
-            self._count_moves(totals, part, inferred.moved)
-            log_likelihood += float(_known(inferred.log_likelihood, part.mask).sum())
-        return self._maximised(found, totals), log_likelihood / self.count
+            inferred = smooth(prior.first, *prior._inputs(chunk.plans, chunk.cells, log_probs[chunk.entries]))
+            self._count(new_modes, chunk, inferred.smoothed)
+            self._count_moves(totals, chunk, inferred.moved)
+            log_likelihood += float(_select(inferred.log_likelihood, chunk.mask).sum())
+        return self._maximise(new_modes, totals), log_likelihood / self.count
 
     def take(self, modes: Modes) -> None:
         """Let the prior be what was learned from all folds."""
@@ -523,18 +525,18 @@ class _Learner:
         size = self.prior.num_modes * self.prior.phases
         return self.prior.transitions.new_zeros(len(self.prior.transitions), size, size)
 
-    def _count(self, modes: Modes, part: _Part, smoothed: Tensor) -> None:
+    def _count(self, modes: Modes, chunk: _Chunk, smoothed: Tensor) -> None:
         """Add the modes `[n, L, K * D]` of a part to `first` and `expected`."""
-        started = smoothed[:, 0].contiguous() if part.mask is None else smoothed[part.mask[:, 0], 0]
+        started = smoothed[:, 0].contiguous() if chunk.mask is None else smoothed[chunk.mask[:, 0], 0]
         modes.first.add_(started.sum(0))
-        known = _known(part.entries, part.mask), _known(self.prior._summed(smoothed), part.mask)
-        modes.expected[part.fold].index_add_(0, *known)
+        entries, weights = _select(chunk.entries, chunk.mask), _select(self.prior._sum_phases(smoothed), chunk.mask)
+        modes.expected[chunk.fold].index_add_(0, entries, weights)
 
-    def _count_moves(self, totals: Tensor, part: _Part, moved: Tensor) -> None:
-        mask = None if part.mask is None else part.mask[:, 1:]
-        totals.index_add_(0, _known(part.cells[:, 1:], mask), _known(moved, mask))
+    def _count_moves(self, totals: Tensor, chunk: _Chunk, moved: Tensor) -> None:
+        mask = None if chunk.mask is None else chunk.mask[:, 1:]
+        totals.index_add_(0, _select(chunk.cells[:, 1:], mask), _select(moved, mask))
 
-    def _maximised(self, modes: Modes, totals: Tensor) -> Modes:
+    def _maximise(self, modes: Modes, totals: Tensor) -> Modes:
         """The probabilities of the first modes and of the transitions, from expected numbers."""
         prior, size = self.prior, len(modes.first)
         first = modes.first + prior.smoothing / size
@@ -555,7 +557,7 @@ class _Learner:
         return Modes(first / first.sum(), _rows(counts + prior.smoothing * everywhere), modes.expected)
 
 
-def _known(values: Tensor, mask: Tensor | None) -> Tensor:
+def _select(values: Tensor, mask: Tensor | None) -> Tensor:
     """What `values [n, L, ...]` are where `mask [n, L]` is true, one after the other; None: all of them."""
     return values.flatten(0, 1) if mask is None else values[mask]
 
