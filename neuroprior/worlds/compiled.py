@@ -41,17 +41,17 @@ def rollout(
     if batch < threads and num_plans % threads == 0:  # the threads share the plans of each start
         cell, offset = cell.repeat_interleave(threads), offset.repeat_interleave(threads)
         batch, num_plans = batch * threads, num_plans // threads
-    given = [x.contiguous().numpy() for x in (table, reward.flatten(), cell, offset, actions_of)]
+    inputs = [x.contiguous().numpy() for x in (table, reward.flatten(), cell, offset, actions_of)]
     last, gained = new_empty((rows,), plans, torch.int64), new_empty((rows, length), reward)
     states = new_empty((rows, length if keep_states else 0), plans, torch.int64)
     written = [x.numpy() for x in (last, gained, states)]
     sizes = num_plans, len(table) // reward.shape[1], reward.dim() == 2
 
-    def part(edges: tuple[int, int]) -> None:
-        _follow(*given, *sizes, *edges, *written)
+    def follow_between(edges: tuple[int, int]) -> None:
+        _follow(*inputs, *sizes, *edges, *written)
 
     number = max(min(PARTS * threads, batch, plans.numel() // LEAST_STEPS), 1)
-    share(part, list(pairwise(batch * k // number for k in range(number + 1))))
+    share(follow_between, list(pairwise(batch * k // number for k in range(number + 1))))
     shaped = [x.view(*plans.shape[:2], *x.shape[1:]) for x in (last, gained, states)]
     return shaped[0], shaped[1], shaped[2] if keep_states else None
 

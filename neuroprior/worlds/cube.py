@@ -87,13 +87,13 @@ class PocketCube(World):
         state = torch.zeros(batch_size, dtype=torch.long, device=self.device)
         for _ in range(self.scramble):
             move = torch.randint(self.num_actions, (batch_size,), generator=generator, device=self.device)
-            state = self._after(state, move)
+            state = self._turn(state, move)
         return state
 
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         if state.device.type == "cpu":
             self.check_state(state)
-        after = self._after(state, check_action(action, len(state), self.num_actions))
+        after = self._turn(state, check_action(action, len(state), self.num_actions))
         if self.absorbing:
             ended = state == 0
             after = after.masked_fill(ended, 0)
@@ -103,7 +103,7 @@ class PocketCube(World):
             return after, (after == 0).float()
         return after, -self._distances[after].float()
 
-    def _after(self, state: Tensor, action: Tensor) -> Tensor:
+    def _turn(self, state: Tensor, action: Tensor) -> Tensor:
         permutation = state.div(_ORIENTATIONS, rounding_mode="floor")
         orientation = state - permutation * _ORIENTATIONS
         moved = self._permutation_moves.view(-1)[permutation * self.num_actions + action]
@@ -212,7 +212,7 @@ def _all_distances(turns: Literal["half", "quarter"], device: torch.device) -> T
     while len(frontier):
         depth += 1
         for action in range(world.num_actions):  # one at a time: the largest frontier has 1,887,748 states
-            after = world._after(frontier, torch.full_like(frontier, action))
+            after = world._turn(frontier, torch.full_like(frontier, action))
             distances[after[distances[after] == unknown]] = depth
         frontier = (distances == depth).nonzero()[:, 0]
     return distances

@@ -63,8 +63,8 @@ class EpisodicWorld(TabularWorld):
                 raise ValueError(f"`{name}` must be one entry for each of {self.num_states} states, got {len(table)}")
         if not (starts >= 0).all() or not starts.sum() > 0:
             raise ValueError("`starts` must be probabilities, got all of them 0")
-        here = ended.nonzero()[:, 0]
-        if not (self.next_state[here].flatten(1) == here[:, None]).all():
+        ended_states = ended.nonzero()[:, 0]
+        if not (self.next_state[ended_states].flatten(1) == ended_states[:, None]).all():
             raise ValueError("ended: every action must stay where an episode has ended")
         self.starts, self.ended, self.features = starts, ended, features
         self._locate = locate

@@ -125,17 +125,17 @@ def _dig(height: int, width: int, num_layouts: int, generator: torch.Generator) 
     walls[layout, path[:, 0]] = False
     # Each square is entered once, and left backwards at most once.
     for _ in range(2 * (num_rooms - 1)):
-        here = path[layout, depth]
-        new = inside[here]
-        new &= walls.gather(1, torch.where(new, here[:, None] + 2 * step, 0))
+        square = path[layout, depth]
+        new = inside[square]
+        new &= walls.gather(1, torch.where(new, square[:, None] + 2 * step, 0))
         way = torch.where(new, torch.rand(new.shape, generator=generator), -1.0).argmax(1)
         on = new.any(1)
         # A walk that cannot go on carves its own square again.
         by = torch.where(on, step[way], 0)
-        walls[layout, here + by] = False
-        walls[layout, here + 2 * by] = False
+        walls[layout, square + by] = False
+        walls[layout, square + 2 * by] = False
         depth = torch.where(on, depth + 1, (depth - 1).clamp(min=0))
-        path[layout[on], depth[on]] = (here + 2 * by)[on]
+        path[layout[on], depth[on]] = (square + 2 * by)[on]
     return walls.view(num_layouts, height, width)
 
 

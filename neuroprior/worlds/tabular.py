@@ -240,11 +240,11 @@ class TabularWorld(World):
         """Where every action stays in the cell, without reward."""
         cell = self.cell(state)
         ended = (self.next_state[cell].flatten(1) == cell[:, None]).all(1)
-        here = ended.nonzero()[:, 0]
-        gains = self.reward[self.reward_map(state[here]), cell[here]]
+        rows = ended.nonzero()[:, 0]
+        gains = self.reward[self.reward_map(state[rows]), cell[rows]]
         if gains.dim() == 3 and self.outcomes is not None:
-            gains = gains.masked_fill(self.outcomes.probability[cell[here]] == 0, 0)
-        ended[here] = (gains == 0).unsqueeze(-1).flatten(1).all(1)
+            gains = gains.masked_fill(self.outcomes.probability[cell[rows]] == 0, 0)
+        ended[rows] = (gains == 0).unsqueeze(-1).flatten(1).all(1)
         return ended
 
     def check_state(self, state: Tensor) -> None:

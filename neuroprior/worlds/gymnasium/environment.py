@@ -126,7 +126,7 @@ class Flattener:
         if isinstance(space, spaces.Dict):
             parts = [self._flatten(inner, observation[key]) for key, inner in space.spaces.items()]
         elif isinstance(space, spaces.Tuple):
-            parts = [self._flatten(inner, part) for inner, part in zip(space.spaces, observation, strict=True)]
+            parts = [self._flatten(inner, value) for inner, value in zip(space.spaces, observation, strict=True)]
         elif _is_flat(space) and not isinstance(space, spaces.Text):
             parts = [np.asarray(spaces.flatten(space, observation), dtype=np.float32).ravel()]
         else:

@@ -34,9 +34,9 @@ def has_table(env: Any) -> bool:
 def overrides_step(env: Any) -> bool:
     """Whether a class of the user's steps otherwise than the toy text of Gymnasium that it inherits a table from."""
     kinds = type(env).__mro__
-    own = next(kind for kind in kinds if "step" in vars(kind))
+    definer = next(kind for kind in kinds if "step" in vars(kind))
     inherits = any(kind.__module__.startswith("gymnasium.envs") for kind in kinds)
-    return inherits and not own.__module__.startswith("gymnasium.")
+    return inherits and not definer.__module__.startswith("gymnasium.")
 
 
 def read_table(env: Any) -> EpisodicWorld:
@@ -54,7 +54,7 @@ def read_table(env: Any) -> EpisodicWorld:
     if getattr(base, "fickle_passenger", False):
         raise ValueError("fickle_passenger: the passenger's changes of mind are not in the environment's table P")
     next_state, reward, probability, ends = _outcomes(base.P, int(env.action_space.n))
-    next_state, ended = _absorbing(next_state, probability, ends)
+    next_state, ended = _make_absorbing(next_state, probability, ends)
     states = len(ends)
     extra = len(ended) - states
     reward = torch.cat([reward, reward.new_zeros(extra, *reward.shape[1:])])
@@ -84,7 +84,9 @@ def _outcomes(table: Any, actions: int) -> tuple[torch.Tensor, ...]:
     return next_state.long(), reward.float(), probability.contiguous(), ends.bool()
 
 
-def _absorbing(next_state: torch.Tensor, probability: torch.Tensor, ends: torch.Tensor) -> tuple[torch.Tensor, ...]:
+def _make_absorbing(
+    next_state: torch.Tensor, probability: torch.Tensor, ends: torch.Tensor
+) -> tuple[torch.Tensor, ...]:
     """Transitions in which ended episodes stay where they ended, `[S or S + 1, A, K]`, and where that is.
 
     A state into which only transitions lead that end the episode becomes absorbing itself. Where others lead there,
@@ -94,11 +96,11 @@ def _absorbing(next_state: torch.Tensor, probability: torch.Tensor, ends: torch.
     possible = probability > 0
     final = torch.zeros(states, dtype=torch.bool)
     final[next_state[ends & possible]] = True
-    here = torch.arange(states)[:, None, None].expand_as(next_state)
+    state = torch.arange(states)[:, None, None].expand_as(next_state)
     ended, before = final, None
     while before is None or not ended.equal(before):
         before = ended
-        running = possible & ~ends & ~ended[here]
+        running = possible & ~ends & ~ended[state]
         ended = ended.index_fill(0, next_state[running], False)
     shared = final & ~ended
     next_state = torch.where(ends & possible & shared[next_state], states, next_state)
@@ -303,9 +305,9 @@ def _bar(progress: bool) -> Iterator[Callable[[int, int], None]]:
     except ImportError:
         rich = None
     if rich is None or console is None or not console.is_terminal:
-        yield lambda done, found: None
+        yield lambda done, total: None
         return
     columns = (rich.TextColumn("{task.completed:,.0f} of {task.total:,.0f} states found so far"), rich.BarColumn())
     with rich.Progress(*columns, rich.TimeElapsedColumn(), console=console, transient=True) as bar:
         task = bar.add_task("states", total=1)
-        yield lambda done, found: bar.update(task, completed=done, total=found)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

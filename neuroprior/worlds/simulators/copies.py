@@ -92,11 +92,11 @@ class _SharingCopier(Copier):
 
     def _share(self, simulator: Any) -> dict[int, Path]:
         """The paths of what copies share by the addresses of the same in a new simulator: generators, and modules."""
-        found = {path: value for path, value in walk(simulator) if isinstance(value, (*GENERATORS, ModuleType))}
-        for path in found.keys() - self._shared.keys():
-            value = found[path]
+        shared = {path: value for path, value in walk(simulator) if isinstance(value, (*GENERATORS, ModuleType))}
+        for path in shared.keys() - self._shared.keys():
+            value = shared[path]
             self._shared[path] = value if isinstance(value, ModuleType) else copy.deepcopy(value)
-        return {id(value): path for path, value in found.items()}
+        return {id(value): path for path, value in shared.items()}
 
     def enter(self, simulator: Any, seed: int) -> Any:
         places = self._share(simulator)

@@ -145,7 +145,7 @@ class Driver:
             return View(None, mask)
         if isinstance(self.observe, FromStep):
             return View(None if observation is None else self.as_declared(observation), mask)
-        return View(self._checked(self.observe(simulator)), mask)
+        return View(self._check(self.observe(simulator)), mask)
 
     def legal_numbers(self, view: View) -> Array:
         """The numbers of the actions that are legal, all where that is not known."""
@@ -157,9 +157,9 @@ class Driver:
 
     def as_declared(self, observation: Any) -> Any:
         """What `step` returned as an observation of this world."""
-        return self._checked(self.observe.transform(observation))
+        return self._check(self.observe.transform(observation))
 
-    def _checked(self, value: Any) -> Any:
+    def _check(self, value: Any) -> Any:
         """An observation as declared: an integer, or float32 `[C]`."""
         if isinstance(self.observation, Categories):
             number = self.observation.number

@@ -110,16 +110,16 @@ class _Writer:
         elif _is_plain(kind):
             self._attributes(value)
         else:
-            self._reduced(value)
+            self._reduction(value)
 
-    def _reduced(self, value: Any) -> None:
+    def _reduction(self, value: Any) -> None:
         """What pickle would write, for a value that is more than its attributes."""
         try:
             reduced = value.__reduce_ex__(4)
         except Exception as error:
             raise ValueError(f"a {type(value).__name__} cannot be read, so that states cannot be compared") from error
-        for part in reduced:
-            self.value(list(part) if isinstance(part, Iterator) else part)
+        for entry in reduced:
+            self.value(list(entry) if isinstance(entry, Iterator) else entry)
 
 
 @lru_cache(1000)

@@ -132,11 +132,11 @@ class SimulatorWorld(World):
                 raise ValueError(f"`simulator` must be of the world's class {names}, got {kind_of(one)}")
         observations, infos = (list(x) if several and x is not None else [x] * len(each) for x in (observation, info))
         with keep_global_generators():
-            found = [
+            states = [
                 self._pin(enter(self.driver, self.copier, one if self.prepare is None else self.prepare(one), *seen))
                 for one, *seen in zip(each, observations, infos, strict=True)
             ]
-        return torch.tensor(found, dtype=torch.long)
+        return torch.tensor(states, dtype=torch.long)
 
     def are_same(self, state: Tensor) -> bool:
         """Whether simulators in `state [N]` hold the same, as far as that can be read, beside random generators."""
@@ -324,11 +324,11 @@ class SimulatorWorld(World):
         parts = [slice(n, None, self._workers) for n in range(self._workers)]
         copier, sent = self.copier.to_process(snapshot)
         shared = Parallel(self._workers)(
-            delayed(follow_plans)(self.driver, copier, sent, view, plans[part], seeds[part]) for part in parts
+            delayed(follow_plans)(self.driver, copier, sent, view, plans[index], seeds[index]) for index in parts
         )
         paths = [None] * len(keys)  # type: ignore[list-item]
-        for part, (some, draws) in zip(parts, shared, strict=True):
-            paths[part] = some
+        for index, (worker_paths, draws) in zip(parts, shared, strict=True):
+            paths[index] = worker_paths
             self._drew |= draws
         return paths
 
