@@ -91,10 +91,10 @@ def describe(value: object) -> str:
 
 def as_list(name: str, values: Any) -> list[Any]:
     """A list of the values, numpy's and torch's as Python's numbers; raises ValueError for a single one."""
-    found = values.tolist() if hasattr(values, "tolist") else values
-    if not isinstance(found, Iterable) or isinstance(found, str):
+    numbers = values.tolist() if hasattr(values, "tolist") else values
+    if not isinstance(numbers, Iterable) or isinstance(numbers, str):
         raise ValueError(f"`{name}` must be a list of numbers, got {values!r}")
-    return [one.item() if hasattr(one, "item") else one for one in found]
+    return [one.item() if hasattr(one, "item") else one for one in numbers]
 
 
 def is_whole(value: object) -> TypeGuard[int]:
@@ -145,11 +145,11 @@ def check_flags(**flags: object) -> None:
             raise ValueError(f"`{name}` must be True or False, got {flag!r}")
 
 
-def check_choices(name: str, given: object, known: Sequence[str], least: int = 1) -> None:
-    """Raise ValueError unless `given` are at least so many of the names that are known."""
-    some = given if isinstance(given, Sequence) and not isinstance(given, str) else None
-    if some is None or len(some) < least or any(one not in list(known) for one in some):
-        raise ValueError(f"`{name}` must be a list of some of {', '.join(known)}, got {given!r}.")
+def check_choices(name: str, values: object, choices: Sequence[str], least: int = 1) -> None:
+    """Raise ValueError unless `values` are at least so many of the choices."""
+    names = values if isinstance(values, Sequence) and not isinstance(values, str) else None
+    if names is None or len(names) < least or any(one not in list(choices) for one in names):
+        raise ValueError(f"`{name}` must be a list of some of {', '.join(choices)}, got {values!r}.")
 
 
 def check_share(name: str, share: object) -> None:
@@ -159,7 +159,7 @@ def check_share(name: str, share: object) -> None:
 
 
 def check_same_names(
-    name: str, own: Sequence[str] | None, given: Sequence[str] | None, where: str, whose: str, remedy: str = ""
+    name: str, expected: Sequence[str] | None, names: Sequence[str] | None, where: str, whose: str, remedy: str = ""
 ) -> None:
     """Raise ValueError where both have names and these are not the same, in the same order.
 
@@ -167,16 +167,16 @@ def check_same_names(
 
     Args:
         name: of the argument, such as "action_names".
-        own, given: the names that are expected, and those that were found.
-        where, whose: what has the found names, and what the expected ones.
+        expected, names: the names that are expected, and those that are there.
+        where, whose: what has the names, and what the expected ones.
         remedy: the end of the message.
     """
-    if own is None or given is None:
+    if expected is None or names is None:
         return
-    expected, found = (tuple(map(str, names)) for names in (own, given))
-    if expected != found:
+    expected, names = (tuple(map(str, texts)) for texts in (expected, names))
+    if expected != names:
         remedy = remedy or "number them alike"
-        raise ValueError(f"{name}: {', '.join(found)} in {where}, {', '.join(expected)} in {whose}; {remedy}")
+        raise ValueError(f"{name}: {', '.join(names)} in {where}, {', '.join(expected)} in {whose}; {remedy}")
 
 
 def check_alike_named(named: Mapping[str, Sequence[str] | None], remedy: str, what: str = "action_names") -> None:
@@ -187,10 +187,10 @@ def check_alike_named(named: Mapping[str, Sequence[str] | None], remedy: str, wh
         remedy: the end of the message.
         what: the names are, "action_names" or "context_names".
     """
-    known = {where: names for where, names in named.items() if names is not None}
-    first = next(iter(known), "")
-    for where, names in known.items():
-        check_same_names(what, known[first], names, where, first, remedy)
+    names_of = {where: names for where, names in named.items() if names is not None}
+    first = next(iter(names_of), "")
+    for where, names in names_of.items():
+        check_same_names(what, names_of[first], names, where, first, remedy)
 
 
 def check_memory(needed: int, **arguments: object) -> None:

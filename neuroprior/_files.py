@@ -198,8 +198,8 @@ def is_at(descriptor: int, path: Path) -> bool:
 
 def versions(*more: str) -> dict[str, str]:
     """The versions that results depend on, with those of more packages; without those that are not installed."""
-    found = {"neuroprior": __version__, "python": platform.python_version()}
+    installed = {"neuroprior": __version__, "python": platform.python_version()}
     for name in ("torch", "numpy", "scipy", "lightning", "numba", *more):
         with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
+            installed[name] = version(name)
+    return installed

@@ -40,15 +40,15 @@ class Claim:
 
         Results of another command are those of somebody who may want to keep them.
         """
-        self._check(names, *self._known())
+        self._check(names, *self._results())
 
-    def _check(self, names: Iterable[str], known: set[str], command: str) -> None:
-        if self._command and command not in ("", self._command) and any(map(self._is_there, known)):
+    def _check(self, names: Iterable[str], results: set[str], command: str) -> None:
+        if self._command and command not in ("", self._command) and any(map(self._is_there, results)):
             raise ValueError(
                 f"`out` must be a folder without results of another command, got {self.folder}: {command}."
             )
         for name in names:
-            if name not in known and not self._owns_all and self._is_there(name):
+            if name not in results and not self._owns_all and self._is_there(name):
                 raise ValueError(
                     f"`out` must be a folder without {name}, or with that of an earlier run, got {self.folder}."
                 )
@@ -65,21 +65,21 @@ class Claim:
         names = {*names}
         if not names or self._owns_all:
             return
-        known, command = self._known()
-        self._check(names, known, command)
+        results, command = self._results()
+        self._check(names, results, command)
         if self._replaces:
             self._replaces = False
-            for name in known:
+            for name in results:
                 (self.folder / name).unlink(missing_ok=True)
-            known = set()
-        if not names <= known:
-            content = json.dumps({"command": self._command, "files": sorted(known | names)}, indent=2) + "\n"
+            results = set()
+        if not names <= results:
+            content = json.dumps({"command": self._command, "files": sorted(results | names)}, indent=2) + "\n"
             write_whole(self.folder / FILES, content.encode())  # before the files: whoever is killed then owns them
 
     def _is_there(self, name: str) -> bool:
         return os.path.lexists(self.folder / name)
 
-    def _known(self) -> tuple[set[str], str]:
+    def _results(self) -> tuple[set[str], str]:
         """The results that are there by the list in the folder, and the command that wrote them."""
         with suppress(OSError, ValueError, KeyError, TypeError):
             content = read_json(self.folder / FILES)
@@ -127,7 +127,7 @@ def claim(
     if place in claims:
         yield claims[place]
         return
-    made = [one for one in (Path(place), *Path(place).parents) if not one.exists()]
+    new_folders = [one for one in (Path(place), *Path(place).parents) if not one.exists()]
     descriptor = _lock(Path(place), folder, name, seconds)
     claims[place] = Claim(folder, replaces, owns_all, command)
     try:
@@ -138,7 +138,7 @@ def claim(
         with suppress(OSError):
             os.unlink(os.path.join(place, LOCK))  # still locked: who waits for it finds that it is another file
         os.close(descriptor)
-        for one in made:  # unless something was written there
+        for one in new_folders:  # unless something was written there
             with suppress(OSError):
                 one.rmdir()
 
@@ -167,13 +167,13 @@ def claim_out(function: F) -> F:
     signature = inspect.signature(function)
 
     @wraps(function)
-    def claiming(*given: Any, **named: Any) -> Any:
-        bound = signature.bind(*given, **named)
+    def claiming(*positional: Any, **named: Any) -> Any:
+        bound = signature.bind(*positional, **named)
         bound.apply_defaults()
         out = bound.arguments["out"]
         command = function.__name__
         with nullcontext() if out is None else claim(as_folder("out", out), replaces=True, command=command):
-            return function(*given, **named)
+            return function(*positional, **named)
 
     return cast(F, claiming)
 

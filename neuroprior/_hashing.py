@@ -16,10 +16,10 @@ def row_hashes(rows: Tensor) -> Tensor:
     bits = (flat.double() + 0.0).view(torch.int64) if flat.is_floating_point() else flat.long()
     weight = torch.Generator().manual_seed(0)
     factors = torch.randint(-(2**62), 2**62, (bits.shape[1],), generator=weight).to(bits.device) * 2 + 1
-    mixed = (bits ^ _shifted(bits, 29)) * factors
-    return (mixed ^ _shifted(mixed, 32)).sum(1)
+    mixed = (bits ^ _shift(bits, 29)) * factors
+    return (mixed ^ _shift(mixed, 32)).sum(1)
 
 
-def _shifted(bits: Tensor, places: int) -> Tensor:
+def _shift(bits: Tensor, places: int) -> Tensor:
     """Bits shifted to the right; zeros come from the left, also into negative numbers."""
     return (bits >> places) & ((1 << (64 - places)) - 1)

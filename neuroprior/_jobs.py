@@ -165,7 +165,7 @@ def each_result(
         MemoryError: memory ran out or a process was killed.
     """
     call = partial(_attempt, run, parent=os.getpid() if dask is None else None)
-    for index, result in _unordered(call, jobs, processes, dask):
+    for index, result in _unordered_results(call, jobs, processes, dask):
         if isinstance(result, Failure):
             raise result.error(name(jobs[index]))
         yield jobs[index], result
@@ -216,7 +216,7 @@ def _attempt(run: Callable[[Job], Result], job: Job, index: int, parent: int | N
         return index, Failure(error)
 
 
-def _unordered(
+def _unordered_results(
     call: Callable[..., tuple[int, Any]], jobs: Sequence[Any], processes: int, dask: str | None
 ) -> Iterator[tuple[int, Any]]:
     """The results of all jobs, each as soon as it is there."""

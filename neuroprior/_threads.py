@@ -32,14 +32,14 @@ def share(work: Callable[[Part], None], parts: Sequence[Part]) -> None:
     """
     threads, learning = torch.get_num_threads(), torch.is_grad_enabled()
 
-    def alone(part: Part) -> None:
+    def alone(piece: Part) -> None:
         torch.set_num_threads(1)  # of this thread, like the next
         with torch.set_grad_enabled(learning):
-            work(part)
+            work(piece)
 
     if min(threads, len(parts)) <= 1:
-        for part in parts:
-            work(part)
+        for piece in parts:
+            work(piece)
         return
     try:
         with ThreadPoolExecutor(min(threads, len(parts))) as pool:

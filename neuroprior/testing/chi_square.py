@@ -43,7 +43,7 @@ def alike(first: Tensor, second: Tensor, group: Tensor) -> float:
     # The number of smaller values in the same group, and half of the equal ones.
     rank = counts.cumsum(0) - counts / 2 - (total.cumsum(0) - total)[owner]
     bins = owner * BINS + (rank * BINS / total[owner]).long()
-    table = torch.stack([bins[part].bincount(minlength=len(total) * BINS) for part in which.view(2, -1)]).double()
+    table = torch.stack([bins[sample].bincount(minlength=len(total) * BINS) for sample in which.view(2, -1)]).double()
     both = table.sum(0)
     rare = both < 10
     free = int((~rare).sum())

@@ -119,13 +119,13 @@ def _check_steps(planner: Planner, world: TabularWorld, state: Tensor, seed: int
     for one in state[:8, None]:
         counting = _Counting(world)
         decision = planner.plan(counting, one, torch.Generator().manual_seed(seed))
-        given, taken = decision.model_steps, counting.steps
-        require(given == taken, f"model_steps: {given} are given, but {taken} simulator steps were taken")
+        reported, taken = decision.model_steps, counting.steps
+        require(reported == taken, f"model_steps: {reported} are given, but {taken} simulator steps were taken")
         most = max(most, taken)
-    given = planner.plan(world, state[:8], torch.Generator().manual_seed(seed)).model_steps
+    reported = planner.plan(world, state[:8], torch.Generator().manual_seed(seed)).model_steps
     require(
-        given < 2 * most or not given,
-        f"`model_steps` must be those of one start, at most {most}, got {given} of 8 starts",
+        reported < 2 * most or not reported,
+        f"`model_steps` must be those of one start, at most {most}, got {reported} of 8 starts",
     )
 
 

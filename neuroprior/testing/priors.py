@@ -44,8 +44,8 @@ def check_prior(prior: Any, length: int | None = None, num_plans: int = 20_000, 
     """
     if check_by_kind(PRIOR_CHECKS, prior, length, num_plans, seed):
         return
-    found = f"the class {prior.__name__}" if isinstance(prior, type) else type(prior).__name__
-    require(isinstance(prior, Prior), f"`prior` must be a Prior, as `fit` has to return it, got {found}")
+    kind = f"the class {prior.__name__}" if isinstance(prior, type) else type(prior).__name__
+    require(isinstance(prior, Prior), f"`prior` must be a Prior, as `fit` has to return it, got {kind}")
     actions = prior.num_actions
     if length is None:
         length = max((n for n in range(1, 6) if actions**n <= 1024), default=1)
@@ -90,11 +90,13 @@ def _random_context(
 @torch.no_grad()
 def _check_outputs(prior: Prior, plans: Tensor, context: Tensor | None) -> None:
     """`start` and `step` return floating point logits `[N, A]` and a state, and leave the state before as it is."""
-    given = _at(context, 0)
+    step_context = _context_at(context, 0)
     state: Any = None
     kept: Any = None
     for method in ("start", "step"):
-        outputs = prior.start(len(plans), given) if method == "start" else prior.step(plans[:, 0], state, given)
+        outputs = (
+            prior.start(len(plans), step_context) if method == "start" else prior.step(plans[:, 0], state, step_context)
+        )
         _, after = unless_refused(partial(check_outputs, outputs, len(plans), prior.num_actions, method))
         if kept is not None:
             same = all(map(torch.equal, tensors_in(kept), tensors_in(state)))
@@ -120,7 +122,7 @@ def _check_stepping(prior: Prior, plans: Tensor, context: Tensor | None, stays: 
     """`start` and `step` give what `forward` gives; some rows, reordered, have the logits that they have among all."""
     num, length = plans.shape
     if stays:
-        _, state = prior.start(num, _at(context, 0))
+        _, state = prior.start(num, _context_at(context, 0))
         try:
             prior.step(plans[:, 0], state, None)
         except Exception as error:
@@ -133,10 +135,10 @@ def _check_stepping(prior: Prior, plans: Tensor, context: Tensor | None, stays: 
     rounding = 1e-4 if plans.device.type == "cpu" else 1e-3
     require(not whole.isnan().any(), "forward: NaN in the logits")
     whole = whole.log_softmax(-1)
-    given = _at(context, 0)
-    logits, state = prior.start(num, given)
-    some = torch.arange(num - 1, -1, -2, device=plans.device)
-    gap = _largest_gap(prior(plans[some], None if context is None else context[some]), whole[some])
+    step_context = _context_at(context, 0)
+    logits, state = prior.start(num, step_context)
+    rows = torch.arange(num - 1, -1, -2, device=plans.device)
+    gap = _largest_gap(prior(plans[rows], None if context is None else context[rows]), whole[rows])
     require(gap < rounding, f"forward: the logits of a plan change by {gap:.2g} nats with the plans beside it")
     for t in range(length):
         kind = "no context" if context is None else f"context {list(context.shape)}"
@@ -144,10 +146,12 @@ def _check_stepping(prior: Prior, plans: Tensor, context: Tensor | None, stays: 
         gap = _largest_gap(logits, whole[:, t])
         require(gap < rounding, f"stepping differs from forward by {gap:.2g} nats ({where})")
         if t + 1 < length:
-            given = None if stays else _at(context, t + 1)
-            few, _ = prior.step(plans[some, t], select_rows(state, some), None if given is None else given[some])
-            logits, state = prior.step(plans[:, t], state, given)
-            gap = _largest_gap(few, logits[some])
+            step_context = None if stays else _context_at(context, t + 1)
+            few, _ = prior.step(
+                plans[rows, t], select_rows(state, rows), None if step_context is None else step_context[rows]
+            )
+            logits, state = prior.step(plans[:, t], state, step_context)
+            gap = _largest_gap(few, logits[rows])
             message = f"step: the logits of a plan change by {gap:.2g} nats with the plans beside it ({where})"
             require(gap < rounding, message)
 
@@ -159,7 +163,7 @@ def _largest_gap(logits: Tensor, others: Tensor) -> float:
 
 def _check_refusals(prior: Prior, generator: torch.Generator) -> None:
     """Unknown actions and contexts are refused, as `Prior.check_start` and `Prior.check_step` do."""
-    context = _at(_random_context(prior, 3, 1, generator), 0)
+    context = _context_at(_random_context(prior, 3, 1, generator), 0)
     _, state = prior.start(3, context)
     for action in (-1, prior.num_actions):
         wrong = torch.full((3,), action, device=prior.device)
@@ -177,7 +181,7 @@ def _check_refusals(prior: Prior, generator: torch.Generator) -> None:
         require(refused, "step must raise ValueError for an unknown context")
 
 
-def _at(context: Tensor | None, t: int) -> Tensor | None:
+def _context_at(context: Tensor | None, t: int) -> Tensor | None:
     return None if context is None else context[:, t]
 
 
@@ -204,8 +208,8 @@ def _check_samples(
 ) -> None:
     """A chi-square test of samples against `log_prob`."""
     expected = _all_log_probs(prior, length, context).double().exp().cpu() * num_plans
-    given = None if context is None else context.expand(num_plans, *context.shape[1:])
-    plans = sample(prior, num_plans, length, given, generator=generator, method=method).cpu().long()
+    contexts = None if context is None else context.expand(num_plans, *context.shape[1:])
+    plans = sample(prior, num_plans, length, contexts, generator=generator, method=method).cpu().long()
     require(plans.shape == (num_plans, length), f"sample: {list(plans.shape)}, not {[num_plans, length]}")
     base = prior.num_actions ** torch.arange(length - 1, -1, -1)
     counts = (plans * base).sum(1).bincount(minlength=len(expected)).double()

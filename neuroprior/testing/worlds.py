@@ -48,8 +48,8 @@ def check_world(world: Any, num_states: int = 50, length: int = 6, seed: int = 0
         return
     require(isinstance(world, World), f"`world` must be a World, got {type(world).__name__}")
     number = getattr(world, "num_actions", None)
-    some = isinstance(number, Integral) and int(number) > 0
-    require(some, f"`num_actions` must be an integer above 0, got {number!r}")
+    has_actions = isinstance(number, Integral) and int(number) > 0
+    require(has_actions, f"`num_actions` must be an integer above 0, got {number!r}")
     generator = torch.Generator().manual_seed(seed)
     state = check_reset(world, num_states, seed)
     plans, wrong_plans = _plans(world, state, length, generator)
@@ -145,10 +145,10 @@ def _check_reached(
     generator: torch.Generator,
 ) -> None:
     """In the states that plans lead to: queries; terminated ones stay, and give nothing."""
-    found = [state.repeat_interleave(plans.shape[1], 0)]
+    states = [state.repeat_interleave(plans.shape[1], 0)]
     for actions in plans.flatten(0, 1).unbind(1):
-        found.append(world.step(found[-1], actions, generator)[0])
-    reached = torch.cat(found)
+        states.append(world.step(states[-1], actions, generator)[0])
+    reached = torch.cat(states)
     _check_queries(world, reached)
     check_queries(world, reached)
     ends = reached[world.terminated(reached)]
@@ -183,7 +183,7 @@ def _check_step(world: Simulator, state: Tensor, action: Tensor, seed: int) -> N
     """`step`: shapes, dtypes, seeds, and no change to what it was given."""
     kept = state.clone(), action.clone()
     outcome: object = world.step(state, action, torch.Generator().manual_seed(seed))
-    pair = isinstance(outcome, tuple) and [isinstance(part, Tensor) for part in outcome] == [True, True]
+    pair = isinstance(outcome, tuple) and [isinstance(value, Tensor) for value in outcome] == [True, True]
     require(pair, "step must return a tuple of two tensors: the next state and the reward")
     after, reward = cast(tuple[Tensor, Tensor], outcome)
     require(state.equal(kept[0]), "step changed the state that it was given")
@@ -237,13 +237,13 @@ def _check_choices(world: World, state: Tensor) -> None:
     if group is not None:
         fits = isinstance(group, Tensor) and group.dtype == torch.int64 and group.shape == state.shape[:1]
         require(fits, f"group must return int64 [{len(state)}], or None")
-        check_batch("group", lambda some: cast(Tensor, world.group(some)), state, group)
+        check_batch("group", lambda batch: cast(Tensor, world.group(batch)), state, group)
 
 
 def check_batch(name: str, query: Callable[[Tensor], Tensor], state: Tensor, whole: Tensor) -> None:
     """What is found in a state, `whole` in all of them, does not depend on its batch, nor on its place there."""
-    for some in (slice(len(state) // 2, None), slice(1, None), slice(0, 1)):
-        alone = same(query(state[some]), whole[some])
+    for rows in (slice(len(state) // 2, None), slice(1, None), slice(0, 1)):
+        alone = same(query(state[rows]), whole[rows])
         require(alone, f"{name}: what is found in a state depends on its batch")
 
 
