@@ -206,21 +206,36 @@ class Recordings:
         if factor is None:
             yield "", self
             return
+        levels = self.watched_levels(factor)
         for level in sorted(pd.unique(self.events[factor])):
             inside = (self.events[factor] == level).to_numpy()
-            pairs = self.events[inside][KEYS].drop_duplicates()
             level_recordings = self._replace_events(self.events[inside], self.fragment[inside])
-            yield str(level), replace(level_recordings, spans=self.watched.merge(pairs, on=KEYS))
+            spans = self.watched[(levels == level).to_numpy()].reset_index(drop=True)
+            yield str(level), replace(level_recordings, spans=spans)
+
+    def watched_levels(self, factor: str) -> "pd.Series[Any]":
+        """Return the level of a factor in each row of `watched`: that of the recording's events.
+
+        Where a recording has no events, it is the subject's only level; NaN where this has several or none.
+        """
+        levels = self.events.groupby(KEYS)[factor].first().rename("level")
+        of_subject = self.events.groupby("subject")[factor].agg(["first", "nunique"])
+        only = of_subject["first"].where(of_subject["nunique"] == 1)
+        spans = self.watched.join(levels, on=KEYS)
+        return spans["level"].fillna(spans["subject"].map(only))
 
     def time_budget(self) -> pd.DataFrame:
-        """Return the share of the watched time that each behaviour takes: rows are subjects, columns behaviours."""
+        """Return the share of the watched time that each behaviour takes: rows are subjects, columns behaviours.
+
+        A subject that was watched and did nothing has shares of 0.
+        """
         watched = self.watched
         time = (watched["stop"] - watched["start"]).groupby(watched["subject"]).sum()
         events = self.events.assign(duration=self.events["stop"] - self.events["start"])
         table = events.pivot_table(
             index="subject", columns="behaviour", values="duration", aggfunc="sum", fill_value=0.0
         )
-        return table.div(time.where(time > 0), axis=0)
+        return table.reindex(table.index.union(time.index), fill_value=0.0).div(time.where(time > 0), axis=0)
 
     def agreement(self) -> pd.DataFrame:
         """Return how well observers agree: Cohen's kappa over time, for each behaviour and two observers.

@@ -101,8 +101,10 @@ def time_course(recordings: Recordings, bins: int = BINS) -> pd.DataFrame:
     """
     kept = recordings.of_one_observer()
     columns = ["condition", "behaviour", "time", "share", "low", "high", "subjects"]
+    factor = _shown_factor(kept)
+    condition = kept.watched_levels(factor) if factor else ""
     begin = kept.watched.groupby(KEYS)["start"].min().rename("begin")
-    events, watched = (frame.merge(begin, on=KEYS) for frame in (kept.events, kept.watched))
+    events, watched = (frame.merge(begin, on=KEYS) for frame in (kept.events, kept.watched.assign(condition=condition)))
     longest = float((watched["stop"] - watched["begin"]).max())
     if not longest > 0:
         return pd.DataFrame(columns=columns)
@@ -113,9 +115,7 @@ def time_course(recordings: Recordings, bins: int = BINS) -> pd.DataFrame:
         start, stop = ((frame[end] - frame["begin"]).to_numpy(np.float64) for end in ("start", "stop"))
         return overlap(start, stop, edges)
 
-    factor = _shown_factor(kept)
     events = events.assign(condition=events[factor] if factor else "")
-    watched = watched.merge(events.groupby(KEYS)["condition"].first().reset_index(), on=KEYS)
     time = pd.DataFrame(inside(watched)).groupby([watched["condition"], watched["subject"]]).sum()
     done = pd.DataFrame(inside(events)).groupby([events["condition"], events["subject"], events["behaviour"]]).sum()
     rows = []

@@ -56,3 +56,26 @@ def test_figures_show_each_subject_and_level():
     figure = budget_figure(time_budget(subject_budget(recordings)), subject_budget(recordings))
     assert sum(len(line.get_xdata()) for line in figure.axes[0].lines if line.get_marker() == "o") >= 5
     assert len([axes for axes in course_figure(time_course(recordings)).axes if axes.get_visible()]) == 3
+
+
+@pytest.mark.parametrize("treated", [False, True])
+def test_who_was_watched_and_did_nothing_counts(treated):
+    """m1 grooms in 2 of 5 and in none of 3 frames; m2, in 1 of 4; m3, in none of 2: of its treatment no event tells."""
+    groomed = {("m1", 1): "01100", ("m1", 2): "000", ("m2", 1): "0001", ("m3", 1): "00"}
+    rows = [
+        (animal, session, frame, "groom" if done == "1" else "")
+        for (animal, session), cells in groomed.items()
+        for frame, done in enumerate(cells)
+    ]
+    frames = pd.DataFrame(rows, columns=["animal", "session", "frame", "behaviour"])
+    if treated:
+        frames["treatment"] = frames["animal"].map({"m1": "drug", "m2": "saline", "m3": "saline"})
+    recordings = read(frames)
+    each = subject_budget(recordings).set_index("subject")["share"].to_dict()
+    nothing = {} if treated else {"m3": 0.0}
+    assert each == pytest.approx({"m1": 2 / 8, "m2": 1 / 4} | nothing)
+    course = time_course(recordings, bins=1).set_index("condition")
+    if treated:
+        assert course["share"].to_dict() == pytest.approx({"drug": 2 / 8, "saline": 1 / 4})
+    else:
+        assert course["share"].tolist() == pytest.approx([(2 / 8 + 1 / 4 + 0) / 3])
