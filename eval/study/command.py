@@ -98,7 +98,7 @@ def study(
         job_rows = run.do(jobs, processes=processes, dask=dask, title="studies")
         rows = [asdict(job) | row for job, batch in zip(jobs, job_rows, strict=True) for row in batch]
         frame = pd.DataFrame(
-            rows, columns=["design", "effect", "kind", "study", "level", "test", "p", "corrected", "feature"]
+            rows, columns=["design", "effect", "kind", "study", "level", "test", "p_value", "p_corrected", "feature"]
         )
         frames["tests"] = _shares(frame[frame["kind"] == "test"])
         frames["features"] = _features(frame[frame["kind"] == "feature"], with_effect)
@@ -145,7 +145,9 @@ def compared(numbers: dict[str, int], batch: Batch) -> list[dict[str, Any]]:
         tests |= {} if one.interaction is None else {INTERACTION: (one.interaction.p_value, one.interaction.p_value)}
         level = (ceil(LEVEL / one.smallest_p - 1e-9) - 1) * one.smallest_p
         common = {"study": seed, "level": level}
-        rows += [{"kind": "test", **common, "test": name, "p": p, "corrected": c} for name, (p, c) in tests.items()]
+        rows += [
+            {"kind": "test", **common, "test": name, "p_value": p, "p_corrected": c} for name, (p, c) in tests.items()
+        ]
         for family in one.families:
             for feature in one.significant(family).nonzero()[:, 0].tolist():
                 spelled = " ".join(names[action] for action in family.features[feature].tolist())
@@ -162,7 +164,7 @@ def _shares(tests: pd.DataFrame) -> pd.DataFrame:
     for (design, test), design_tests in tests.groupby(["design", "test"], sort=False):
         null, effect = design_tests[~design_tests["effect"]], design_tests[design_tests["effect"]]
         row = {"design": design, "test": test, "level": design_tests["level"].iloc[0], "studies": len(null)}
-        for name, p_values in (("alarms", null["p"]), ("power", effect["corrected"])):
+        for name, p_values in (("alarms", null["p_value"]), ("power", effect["p_corrected"])):
             values = share_interval(int((p_values < LEVEL).sum()), len(p_values))
             row |= dict(zip((name, f"{name}_low", f"{name}_high"), values, strict=True))
         rows.append(row)

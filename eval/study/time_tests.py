@@ -110,7 +110,7 @@ def tested(numbers: dict[str, int], batch: Batch) -> list[dict[str, Any]]:
         seed = numbers["seed"] + number
         recordings = recordings_of(timed_study(seed, batch.source, numbers["actions"]))
         plans = recordings.plans(compare="treatment", reference="saline")
-        drift = rate_drift(recordings).frame().set_index("behaviour")["corrected"]
+        drift = rate_drift(recordings).frame().set_index("behaviour")["p_corrected"]
         lags = how_far_back(plans, max_lag=3).corrected
         survival = duration_survival(plans, numbers["permutations"], torch.Generator().manual_seed(seed))
         lasts = pd.Series({name: corrected for name, (_, corrected) in survival.tests.items()})

@@ -267,7 +267,7 @@ def test_the_report_stars_survival_as_findings(subjects, starred):
     plans = censored(0, subjects, 4.0)
     part = duration_section(evaluate_saved({"uniform": UniformPrior(2)}, plans, 0))
     result = duration_survival(plans, generator=seeded(0))
-    assert [one.feature for one in part.findings if one.starred] == starred
+    assert [one.feature for one in part.findings if one.significant] == starred
     assert {one.id: one.p_corrected for one in part.findings if one.family == "survival"} == {
         f"survival: {name}": corrected for name, (_, corrected) in result.tests.items()
     }

@@ -165,11 +165,11 @@ class ConditionComparison:
         means and ratios.
         """
         if not self.families:
-            return pd.DataFrame(columns=["family", "parts", "feature", "p_value", "corrected", "significant"])
+            return pd.DataFrame(columns=["family", "parts", "feature", "p_value", "p_corrected", "significant"])
         frame = pd.concat([self._rows(family) for family in self.families], ignore_index=True)
         rank = frame["family"].map({name: place for place, name in enumerate(FAMILIES)})
         keys = {"rank": rank.where(frame["significant"], len(FAMILIES)), "size": -frame["statistic"]}
-        frame = frame.assign(**keys).sort_values(["rank", "corrected", "p_value", "size"], kind="stable")
+        frame = frame.assign(**keys).sort_values(["rank", "p_corrected", "p_value", "size"], kind="stable")
         return frame.drop(columns=list(keys)).reset_index(drop=True)
 
     def _rows(self, family: ConditionFamily) -> pd.DataFrame:
@@ -183,7 +183,7 @@ class ConditionComparison:
         if len(self.condition_names) == 2:
             for what, numbers in zip(("difference", "low", "high"), family.difference, strict=True):
                 rows[what] = scaled(numbers.numpy())
-        rows["p_value"], rows["corrected"] = family.p_values.numpy(), self.corrected(family).numpy()
+        rows["p_value"], rows["p_corrected"] = family.p_values.numpy(), self.corrected(family).numpy()
         rows["significant"], rows["statistic"] = self.significant(family).numpy(), family.statistic.numpy()
         return rows
 

@@ -80,8 +80,8 @@ class HowFarBack:
 
         frame = pd.DataFrame(self.gains).rename(columns={"mean": "bits"})
         frame.insert(0, "lag", np.arange(len(frame)) + 1)
-        adds = (self.corrected < LEVEL) & (self.few == "")
-        return frame.assign(corrected=self.corrected, units=self.num_units, adds=adds)
+        significant = (self.corrected < LEVEL) & (self.few == "")
+        return frame.assign(p_corrected=self.corrected, units=self.num_units, significant=significant)
 
 
 def _digits(value: float) -> str:

@@ -63,7 +63,7 @@ class RateDrift:
         values = np.array(self.changes)
         bounds = dict(zip(("times", "low", "high"), np.exp(values[:, :3].T), strict=True))
         columns = {"behaviour": list(self.behaviours), "bouts": self.bouts, **bounds}
-        frame = pd.DataFrame(columns | {"p_value": values[:, 3], "corrected": self.corrected})
+        frame = pd.DataFrame(columns | {"p_value": values[:, 3], "p_corrected": self.corrected})
         order = np.lexsort((-np.abs(values[:, 0]), frame["p_value"]))
         return frame.iloc[order].reset_index(drop=True)
 

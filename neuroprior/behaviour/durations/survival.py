@@ -83,7 +83,7 @@ class DurationSurvival:
         for (behaviour, level), curve in self.curves.items():
             rows.setdefault(behaviour, {"behaviour": behaviour})[f"median, {level}".removesuffix(", ")] = curve.median
         frame = pd.DataFrame(list(rows.values()))
-        for place, name in enumerate(("p_value", "corrected", "ratio", "low", "high")):
+        for place, name in enumerate(("p_value", "p_corrected", "ratio", "low", "high")):
             of = {key: (*test, *self.ratios.get(key, [np.nan] * 3))[place] for key, test in self.tests.items()}
             frame[name] = frame["behaviour"].map(of).astype(float)
         return frame

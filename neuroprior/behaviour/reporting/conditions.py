@@ -88,7 +88,7 @@ def _feature_findings(result: ConditionComparison, features: pd.DataFrame, unit:
         scale, suffix = (1, f" {unit}".rstrip()) if of_time else (100, " %")
         ordered = [*reversed(result.condition_names)] if two else result.condition_names  # the reference comes last
         means = listed([f"{scale * row[f'mean, {name}']:.3g}{suffix} under {name}" for name in ordered])
-        p_corrected = row["corrected"]
+        p_corrected = row["p_corrected"]
         sentence = SENTENCES[family].format(*parts, all=" ".join(parts), means=means)
         effect = low = high = None
         if two:
@@ -112,7 +112,7 @@ def _pair_findings(pairs: pd.DataFrame) -> list[Finding]:
         pair = f"{row['second']} against {row['first']}"
         of_time = row["family"] == "durations"
         by = f"{row['difference']:.3g} times" if of_time else f"difference {row['difference']:+.3g}"
-        p_corrected = row["corrected"]
+        p_corrected = row["p_corrected"]
         sentence = (
             f"{pair[0].upper()}{pair[1:]}, {row['feature']}: {by}, 95 % interval {row['low']:.3g} to {row['high']:.3g};"
             f" {p_words(p_corrected)}."
@@ -135,7 +135,7 @@ def _interaction_findings(result: ConditionInteraction, frame: pd.DataFrame) -> 
                 for name in result.stratum_names
             ]
         )
-        p_corrected = row["corrected"]
+        p_corrected = row["p_corrected"]
         name = f"{row['feature']}, by stratum"
         sentence = f"The difference in {row['feature']} depends on the stratum ({differences}; {p_words(p_corrected)})."
         family, p = f"{row['family']}, by stratum", float(row["p_value"])
@@ -198,7 +198,7 @@ def _tests(result: ConditionComparison) -> pd.DataFrame:
     sizes = {family.name: len(family.features) for family in result.families}
     rows: list[tuple[object, ...]] = [("all", pd.NA, result.p_value, result.p_value)]
     rows += [(name, sizes.get(name, 1), *p_values) for name, p_values in result.tests.items()]
-    frame = pd.DataFrame(rows, columns=["test", "features", "p_value", "corrected"])
+    frame = pd.DataFrame(rows, columns=["test", "features", "p_value", "p_corrected"])
     return frame.astype({"features": "Int64"}).assign(smallest_p=result.smallest_p)
 
 
@@ -207,7 +207,9 @@ def _test_table(result: ConditionComparison, tests: pd.DataFrame) -> Table:
         "test": lambda row: TESTS.get(row.test, "all tests together"),
         "features": "features:,",
         "p": lambda row: f"{row.p_value:.2g}",
-        "p corrected": lambda row: "" if row.test == "all" else f"{row.corrected:.2g}" + "*" * result.differs(row.test),
+        "p corrected": lambda row: (
+            "" if row.test == "all" else f"{row.p_corrected:.2g}" + "*" * result.differs(row.test)
+        ),
     }
     prediction = result.prediction
     assert prediction is not None
@@ -231,7 +233,7 @@ def _feature_table(result: ConditionComparison, features: pd.DataFrame) -> Table
             f"{row.difference:{_sign(row)}.3g}" + " times" * (not _sign(row))
         )
         columns["95 % interval"] = lambda row: f"{row.low:{_sign(row)}.3g} to {row.high:{_sign(row)}.3g}"
-    columns["p"] = lambda row: p_text(row.corrected) + "*" * row.significant
+    columns["p"] = lambda row: p_text(row.p_corrected) + "*" * row.significant
     shown = features[:LISTED]
     caption = (
         f"{len(shown)} of {len(features):,} features: *: significant; then those that differ most. Transitions are"
@@ -249,7 +251,7 @@ def _pairs(result: ConditionComparison) -> pd.DataFrame:
         frame = pair.frame().rename(columns={f"mean, {first}": "mean_first", f"mean, {second}": "mean_second"})
         parts.append(frame.assign(first=first, second=second))
     columns = ["first", "second", "family", "feature", "mean_first", "mean_second", "difference", "low", "high"]
-    return pd.concat(parts)[[*columns, "p_value", "corrected", "significant"]]
+    return pd.concat(parts)[[*columns, "p_value", "p_corrected", "significant"]]
 
 
 def _pair_table(result: ConditionComparison, pairs: pd.DataFrame) -> Table:
@@ -259,7 +261,7 @@ def _pair_table(result: ConditionComparison, pairs: pd.DataFrame) -> Table:
         "feature": "feature",
         "difference": lambda row: f"{row.difference:{_sign(row)}.3g}" + " times" * (not _sign(row)),
         "95 % interval": lambda row: f"{row.low:{_sign(row)}.3g} to {row.high:{_sign(row)}.3g}",
-        "p": lambda row: p_text(row.corrected) + "*" * row.significant,
+        "p": lambda row: p_text(row.p_corrected) + "*" * row.significant,
     }
     number = max(LISTED // len(result.contrasts), 1)
     shown = pairs.groupby(["first", "second"], sort=False).head(number)
@@ -280,16 +282,16 @@ def _interaction(interaction: ConditionInteraction, actions: list[str]) -> pd.Da
         for name, difference in zip(interaction.stratum_names, differences, strict=True):
             frame[f"difference, {name}"] = difference.numpy()
         frame["p_value"] = family.p_values.numpy()
-        frame["corrected"] = family.corrected.clamp(min=interaction.tests[family.name][1]).numpy()
-        parts.append(frame.assign(significant=frame["corrected"] < LEVEL))
-    return pd.concat(parts, ignore_index=True).sort_values(["corrected", "p_value"], kind="stable", ignore_index=True)
+        frame["p_corrected"] = family.corrected.clamp(min=interaction.tests[family.name][1]).numpy()
+        parts.append(frame.assign(significant=frame["p_corrected"] < LEVEL))
+    return pd.concat(parts, ignore_index=True).sort_values(["p_corrected", "p_value"], kind="stable", ignore_index=True)
 
 
 def _interaction_table(interaction: ConditionInteraction, frame: pd.DataFrame) -> Table:
     columns: dict[str, Column] = {"feature": "feature"}
     for name in interaction.stratum_names:
         columns[f"difference,\n{name}"] = _cell_of(f"difference, {name}", ".3g")
-    columns["p"] = lambda row: p_text(row.corrected) + "*" * row.significant
+    columns["p"] = lambda row: p_text(row.p_corrected) + "*" * row.significant
     caption = (
         f"{interaction.verdict} Durations are ratios. p: corrected for the features of a family and for the families."
     )

@@ -80,7 +80,7 @@ def duration_section(evaluation: Evaluation) -> Part | None:
         shown = {"model": "model", "without": "without:.4f", "with": "with:.4f", "gain": _gain}
         caption = f"Bits per held-out behaviour without and with the last duration known. {bounds}"
         if not too_few_units:
-            shown["p"] = lambda row: p_text(row.corrected) + "*" * row.starred
+            shown["p"] = lambda row: p_text(row.p_corrected) + "*" * row.significant
             caption += " p: of a gain, corrected for the models (Holm). *: p < 0.05."
         tables.append(table(following, shown, caption, "Whether durations predict the next behaviour"))
     text = [
@@ -198,8 +198,8 @@ def _next_rows(evaluation: Evaluation, plans: RecordedPlans, timed: Tensor) -> p
             rows.append({"model": model.name} | _compare(plain.score, model.score))
     frame = pd.DataFrame(rows)
     if rows:  # a loss, or a gain that is 0 in three digits, is none that was looked for
-        frame["corrected"] = holm(frame["p_value"].where(frame["gain"] >= LEAST, 1.0))
-        frame["starred"] = (frame["corrected"] < LEVEL) & (not too_few(evaluation.plans))
+        frame["p_corrected"] = holm(frame["p_value"].where(frame["gain"] >= LEAST, 1.0))
+        frame["significant"] = (frame["p_corrected"] < LEVEL) & (not too_few(evaluation.plans))
     return frame
 
 

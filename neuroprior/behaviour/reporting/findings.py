@@ -24,9 +24,9 @@ class Finding:
         feature: what was tested, by name.
         effect: its size, in the unit that `sentence` has; None where it is not one number.
         low, high: the 95 % interval of the effect.
-        p: of this feature alone.
+        p_value: of this feature alone.
         p_corrected: for the features of its family, and the families of the question.
-        starred: whether `p_corrected` is below `LEVEL`, and there are enough independent units.
+        significant: whether `p_corrected` is below `LEVEL`, and there are enough independent units.
         sentence: says it with effect, interval and p.
     """
 
@@ -36,9 +36,9 @@ class Finding:
     effect: float | None
     low: float | None
     high: float | None
-    p: float
+    p_value: float
     p_corrected: float
-    starred: bool
+    significant: bool
     sentence: str
 
     def row(self) -> dict[str, Any]:
@@ -49,13 +49,13 @@ class Finding:
 
 
 def gain_finding(family: str, feature: str, what: str, row: Mapping[Any, Any]) -> Finding:
-    """The finding that `what` adds bits: of a row with `bits, low, high, p_value, corrected, starred`."""
-    bits, low, high, p, corrected = (float(row[name]) for name in ("bits", "low", "high", "p_value", "corrected"))
+    """The finding that `what` adds bits: of a row with `bits, low, high, p_value, p_corrected, significant`."""
+    bits, low, high, p, corrected = (float(row[name]) for name in ("bits", "low", "high", "p_value", "p_corrected"))
     sentence = (
         f"{what} adds {bits:.2g} bits to the prediction of the next one, 95 % interval {low:.2g} to {high:.2g};"
         f" {p_words(corrected)}."
     )
-    return Finding(feature, family, feature, bits, low, high, p, corrected, bool(row["starred"]), sentence)
+    return Finding(feature, family, feature, bits, low, high, p, corrected, bool(row["significant"]), sentence)
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def headline(verdicts: Sequence[str], sections: Sequence[Sequence[Finding]]) -> 
         verdicts: answers of sections, such as which model is best.
         sections: the findings of each section, the weightiest first; those that are starred are said.
     """
-    starred = [[one for one in findings if one.starred] for findings in sections]
+    starred = [[one for one in findings if one.significant] for findings in sections]
     places = [(rank, number) for number, section in enumerate(starred) for rank in range(len(section))]
     room = max(MOST_SENTENCES - len(verdicts), 2)
     kept = sorted(places)[: room if len(places) <= room else room - 1]

@@ -85,7 +85,7 @@ def mode_section(evaluation: Evaluation) -> Part | None:
     typical = _typical_sequences(prior, plans)
     if len(typical):
         shown: dict[str, Column] = {"mode": "mode", "sequence": "sequence", "count": "count:,", "ratio": "ratio:.2f"}
-        shown |= {} if evaluation.too_few else {"p": lambda row: p_text(row["corrected"])}
+        shown |= {} if evaluation.too_few else {"p": lambda row: p_text(row["p_corrected"])}
         caption = "Within a mode, against a chain of order n - 2; ratio: times as often as expected."
         caption += (
             "" if evaluation.too_few else " p: Fisher's exact test, corrected for all sequences of a mode (Holm)."
@@ -174,7 +174,7 @@ def _typical_sequences(prior: SwitchingPrior, plans: Plans) -> pd.DataFrame:
         for one in over[:MOST_MOTIFS]:
             sequence = " ".join(names[action] for action in one.actions)
             rows.append((k + 1, sequence, one.count, one.expected, one.ratio, one.corrected))
-    return pd.DataFrame(rows, columns=["mode", "sequence", "count", "expected", "ratio", "corrected"])
+    return pd.DataFrame(rows, columns=["mode", "sequence", "count", "expected", "ratio", "p_corrected"])
 
 
 def _occupancy(prior: SwitchingPrior, plans: Plans) -> pd.DataFrame:

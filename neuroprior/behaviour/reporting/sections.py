@@ -178,7 +178,7 @@ def lag_section(evaluation: Evaluation) -> Part | None:
     findings, verdicts = list[Finding](), list[str]()
     if result is not None:
         frame = frames["how_far_back"] = result.frame()
-        for row in frame.assign(starred=frame["adds"]).to_dict("records"):
+        for row in frame.to_dict("records"):
             findings.append(gain_finding("lags", f"lag {row['lag']}", f"The behaviour {row['lag']} back", row))
         reach = 0 if result.few else result.reach
         if reach:  # the last lag that adds is said with the verdict, before the others
@@ -190,7 +190,7 @@ def lag_section(evaluation: Evaluation) -> Part | None:
             "lag": "lag",
             "bits": "bits:.4f",
             "95 % interval": lambda row: f"{row.low:.4f} to {row.high:.4f}",
-            "p": lambda row: p_text(row.corrected) + "*" * row.adds,
+            "p": lambda row: p_text(row.p_corrected) + "*" * row.significant,
         }
         caption = f"Bits that the behaviour k steps back adds, over {result.unit}."
         caption += "" if result.few else " p: corrected for the lags. *: p < 0.05."
@@ -223,14 +223,14 @@ def motif_section(evaluation: Evaluation) -> Part | None:
         | {key: value for key, value in asdict(one).items() if key != "actions"}
         for one in motifs(plans, top=LISTED)
         if one.corrected < LEVEL
-    )
+    ).rename(columns={"corrected": "p_corrected"})
     columns: Mapping[str, Column] = {
         "sequence": "sequence",
         "count": "count:,",
         "expected": "expected:,.1f",
         "ratio": "ratio:.2f",
         "95 % interval": lambda row: f"{row.low:.2f} to {row.high:.2f}",
-        "p": lambda row: p_text(row.corrected),
+        "p": lambda row: p_text(row.p_corrected),
     }
     few = too_few(plans)
     text = [
@@ -322,12 +322,12 @@ def _rates(evaluation: Evaluation) -> pd.DataFrame:
     source = evaluation.recordings if timed and evaluation.recordings is not None else evaluation.plans
     result = rate_drift(source)
     frame = result.frame()
-    starred = (frame["corrected"] < LEVEL) & (result.num_units >= ENOUGH_UNITS) & (not too_few(evaluation.plans))
+    starred = (frame["p_corrected"] < LEVEL) & (result.num_units >= ENOUGH_UNITS) & (not too_few(evaluation.plans))
     if timed:
         columns = {"times": "by_time", "low": "by_time_low", "high": "by_time_high"}
         by_time = rate_drift(source, "time").frame().rename(columns=columns)
         frame = frame.merge(by_time[["behaviour", *columns.values()]], on="behaviour", how="left")
-    return frame.assign(unit=result.unit, starred=starred)
+    return frame.assign(unit=result.unit, significant=starred)
 
 
 def _rate_table(rates: pd.DataFrame, evaluation: Evaluation) -> Table:
@@ -336,7 +336,7 @@ def _rate_table(rates: pd.DataFrame, evaluation: Evaluation) -> Table:
         "bouts": "bouts:,",
         "end / beginning": "times:.3g",
         "95 % interval": lambda row: f"{row.low:.3g} to {row.high:.3g}",
-        "p": lambda row: p_text(row.corrected) + "*" * row.starred,
+        "p": lambda row: p_text(row.p_corrected) + "*" * row.significant,
     }
     caption = (
         f"Share of all bouts at the end of a recording, divided by that at its beginning; intervals over"
@@ -354,13 +354,13 @@ def _rate_table(rates: pd.DataFrame, evaluation: Evaluation) -> Table:
 def _rate_findings(rates: pd.DataFrame) -> list[Finding]:
     findings = []
     for row in rates.to_dict("records"):
-        name, times, low, high, corrected = (row[what] for what in ("behaviour", "times", "low", "high", "corrected"))
+        name, times, low, high, corrected = (row[what] for what in ("behaviour", "times", "low", "high", "p_corrected"))
         sentence = (
             f"From the beginning to the end of a recording the share of {name} {'falls' if times < 1 else 'rises'} to"
             f" {times:.3g} times, 95 % interval {low:.3g} to {high:.3g}; {p_words(corrected)}."
         )
         estimate = (times, low, high, float(row["p_value"]), float(corrected))
-        feature, starred = f"drift of {name}", bool(row["starred"])
+        feature, starred = f"drift of {name}", bool(row["significant"])
         findings.append(Finding(f"drift: {name}", "drift", feature, *estimate, starred, sentence))
     return findings
 

@@ -58,7 +58,7 @@ def survival_findings(result: DurationSurvival, few: str, unit: str) -> list[Fin
 
 def survival_table(result: DurationSurvival, few: str) -> Table:
     """The medians of each behaviour under each condition, with the test, the clearest difference first."""
-    frame = result.medians().sort_values("corrected", kind="stable")
+    frame = result.medians().sort_values("p_corrected", kind="stable")
     columns: dict[str, Column] = {"behaviour": "behaviour"}
     columns |= {name.replace(", ", ",\n"): f"{name}:.3g" for name in frame.columns if name.startswith("median")}
     caption = "Medians of bouts, of which some were cut off by the end of watching (Kaplan-Meier)."
@@ -67,7 +67,7 @@ def survival_table(result: DurationSurvival, few: str) -> Table:
         caption += " ratio: of mean durations, the second by the first, with its 95 % interval."
     if result.tests and not few:
         columns["p"] = lambda row: (
-            "" if np.isnan(row.corrected) else p_text(row.corrected) + "*" * (row.corrected < LEVEL)
+            "" if np.isnan(row.p_corrected) else p_text(row.p_corrected) + "*" * (row.p_corrected < LEVEL)
         )
         caption += " p: log-rank test, corrected for the behaviours (step-down minP). *: p < 0.05."
     return table(frame[:LISTED], columns, caption, "Survival of bouts")

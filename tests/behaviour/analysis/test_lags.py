@@ -83,18 +83,18 @@ def test_gains_by_hand():
         assert one == pytest.approx(tuple(ratio_difference(gain, size)), abs=1e-7)
     assert (result.unit, result.num_units) == ("subjects", 4)
     assert result.few == "4 subjects are too few for a verdict"
-    assert not result.frame()["adds"].any()
+    assert not result.frame()["significant"].any()
 
 
 def test_the_verdict_names_the_last_lag_that_adds():
     """Also where nearer ones add nothing alone; a loss never counts."""
     gains = [Difference(0.3, 0.2, 0.4, 1e-5), Difference(-0.3, -0.4, -0.2, 1e-5), Difference(0.3, 0.2, 0.4, 1e-9)]
     some = HowFarBack(gains, np.array([1e-5, 1.0, 1.0]), 1, "groups", 9, "")
-    assert some.frame()["adds"].tolist() == [True, False, False]
+    assert some.frame()["significant"].tolist() == [True, False, False]
     assert some.verdict == "How far back: one behaviour; a second adds nothing (-.3 bits, -.4 to -.2)."
     every = HowFarBack(gains, np.array([1e-5, 1.0, 1e-5]), 3, "groups", 9, "")
     assert every.verdict == "How far back: three behaviours at least."
-    assert every.frame()["adds"].tolist() == [True, False, True]
+    assert every.frame()["significant"].tolist() == [True, False, True]
     none = HowFarBack(gains[1:], np.array([1.0, 1.0]), 0, "groups", 9, "")
     assert none.verdict == "How far back: no behaviour; the last adds nothing (-.3 bits, -.4 to -.2)."
 
@@ -103,7 +103,7 @@ def test_a_lag_is_found_that_nearer_ones_hide():
     """Each action is the one two before it: the last one alone says nothing."""
     in_turn = how_far_back(Plans(torch.tensor([[0, 0], [0, 1], [1, 0], [1, 1]] * 10).repeat(1, 30), 2), 3)
     assert in_turn.gains[1].mean > 0.9
-    assert in_turn.frame()["adds"].tolist() == [False, True, False]
+    assert in_turn.frame()["significant"].tolist() == [False, True, False]
     assert in_turn.verdict.startswith("How far back: two behaviours; a third adds nothing")
 
 

@@ -46,7 +46,7 @@ def test_the_tables_hold_what_was_found(conditions):
     assert section.text[0] == found.verdict
     tests = frames["condition_tests"].set_index("test")
     assert tests["p_value"]["all"] == found.p_value
-    assert {name: tuple(tests.loc[name, ["p_value", "corrected"]]) for name in found.tests} == found.tests
+    assert {name: tuple(tests.loc[name, ["p_value", "p_corrected"]]) for name in found.tests} == found.tests
     features = frames["conditions"]
     assert len(features) == sum(len(family.features) for family in found.families)
     assert features["significant"].sum() == sum(int(found.significant(family).sum()) for family in found.families)
@@ -98,9 +98,9 @@ def test_the_headline_says_exactly_what_is_starred(change):
     alike = plans.actions[torch.randperm(48, generator=seeded(3))]
     plans = replace(plans, actions=torch.where(some[:, None], plans.actions, alike))
     results = results_of(report(plans, fits=QUICK_IN_TWO, sections=["conditions"]))
-    starred = [one for one in results["findings"] if one["starred"]]
+    starred = [one for one in results["findings"] if one["significant"]]
     said = [one["finding"] for one in results["headline"] if one["finding"]]
-    assert all(one["starred"] == (one["p_corrected"] < 0.05) for one in results["findings"])
+    assert all(one["significant"] == (one["p_corrected"] < 0.05) for one in results["findings"])
     assert {*said} <= {one["id"] for one in starred}
     rest = [one["feature"] for one in starred if one["id"] not in said]
     last = results["headline"][-1]["sentence"]
@@ -159,7 +159,7 @@ def test_features_that_differ_most_come_first(conditions):
     features = section_of(changed(conditions, 40))[1]["conditions"]
     families = ["transitions", "durations", "behaviours", "sequences"]
     rank = [families.index(row.family) if row.significant else len(families) for row in features.itertuples()]
-    keys = [*zip(rank, features["corrected"], features["p_value"], -features["statistic"], strict=True)]
+    keys = [*zip(rank, features["p_corrected"], features["p_value"], -features["statistic"], strict=True)]
     assert keys == sorted(keys)
     assert len({key[:3] for key in keys}) < len(keys)
 
@@ -176,7 +176,7 @@ def test_each_two_of_three_conditions_have_a_table():
         pair = by_name[first, second]
         row = own.set_index("feature").loc["duration of eat"]
         family = next(family for family in pair.families if family.name == "durations")
-        assert row["corrected"] == max(float(family.corrected[0]), pair.tests["durations"][1])
+        assert row["p_corrected"] == max(float(family.corrected[0]), pair.tests["durations"][1])
         assert [row["difference"], row["low"], row["high"]] == pytest.approx(family.difference[:, 0].exp().tolist())
         assert row["significant"] == ("drug 1" in (first, second))
     shown = next(table for table in section.tables if table.title == "Each two conditions")
@@ -201,8 +201,8 @@ def test_strata_have_a_sentence_and_their_interaction_a_table(conditions):
     assert [row["difference, female"], row["difference, male"]] == pytest.approx(
         family.differences[:, 0].exp().tolist()
     )
-    assert row["corrected"] == family.corrected[0]
-    assert frame["corrected"].is_monotonic_increasing
+    assert row["p_corrected"] == family.corrected[0]
+    assert frame["p_corrected"].is_monotonic_increasing
     permuted = "permuted within 2 strata" in " ".join(section.text)
     assert permuted == (compare_conditions(plans, 9).design.kind == "between")
 

@@ -182,9 +182,11 @@ def test_stars_are_findings():
         part = section(timed(telling))
         (finding,) = (one for one in part.findings if one.family == "next behaviour by duration")
         row = part.frames["next_by_duration"].iloc[0]
-        assert (finding.effect, finding.low, finding.high, finding.p) == tuple(row[["gain", "low", "high", "p_value"]])
+        assert (finding.effect, finding.low, finding.high, finding.p_value) == tuple(
+            row[["gain", "low", "high", "p_value"]]
+        )
         assert finding.p_corrected == (row["p_value"] if row["gain"] > 5e-4 else 1)
-        assert finding.starred == telling
+        assert finding.significant == telling
         for one in part.section.tables[:3]:
             starred = [cell for row in one.rows for cell in row if "*" in cell]
             assert bool(starred) == (telling and one.title == "Whether durations predict the next behaviour")

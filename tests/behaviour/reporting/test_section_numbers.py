@@ -136,8 +136,8 @@ def test_how_far_back_is_of_what_counts(plans, skip):
     result = how_far_back(plans, skip=skip)
     pd.testing.assert_frame_equal(part.frames["how_far_back"], result.frame())
     assert part.verdicts == [result.verdict]
-    assert [one.starred for one in part.findings] == result.frame()["adds"].tolist()
-    assert [row[-1].endswith("*") for row in cells(part)] == result.frame()["adds"].tolist()
+    assert [one.significant for one in part.findings] == result.frame()["significant"].tolist()
+    assert [row[-1].endswith("*") for row in cells(part)] == result.frame()["significant"].tolist()
     assert [one.p_corrected for one in part.findings] == result.corrected.tolist()
 
 
@@ -145,7 +145,7 @@ def test_few_groups_bear_no_verdict_on_how_far_back(plans):
     few = plans[plans.group < 3]
     part = lag_section(evaluate_saved({"uniform": UniformPrior(3)}, few, 0))
     assert part.verdicts == []
-    assert not any(one.starred or "How far back" in one.sentence for one in part.findings)
+    assert not any(one.significant or "How far back" in one.sentence for one in part.findings)
     assert any(how_far_back(few).few in sentence for sentence in part.section.text)
 
 
@@ -188,8 +188,9 @@ def test_over_represented_sequences(worded):
     want = [one for one in every if one.corrected < 0.05]
     assert len([one for one in every if one.p_value < 0.05]) > len(want) > 0
     assert frame["sequence"].tolist() == [" ".join("abcd"[a] for a in one.actions) for one in want]
-    for name in ("count", "expected", "ratio", "low", "high", "p_value", "corrected"):
+    for name in ("count", "expected", "ratio", "low", "high", "p_value"):
         assert frame[name].tolist() == [getattr(one, name) for one in want]
+    assert frame["p_corrected"].tolist() == [one.corrected for one in want]
     first = frame.iloc[0]
     assert cells(part)[0][:3] == [first["sequence"], f"{first['count']:,}", f"{first['expected']:,.1f}"]
 

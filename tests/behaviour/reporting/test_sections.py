@@ -39,7 +39,7 @@ def test_gains_of_one_fold_are_shown_and_not_starred():
     part = lag_section(replace(found_in(plans), gains=gains.assign(what="gain", model="markov", input="behaviours")))
     assert part.section.tables[-1].rows == [["1", "0.3000"], ["6", "0.2000"]]  # lag 5 is in the file alone
     assert [figure.name for figure in part.section.figures] == ["lags"]
-    assert not any(one.starred for one in part.findings)
+    assert not any(one.significant for one in part.findings)
 
 
 @pytest.mark.parametrize(("animals", "starred"), [(6, ["run", "dig", "eat"]), (4, [])])
@@ -55,10 +55,10 @@ def test_drifts_are_starred_as_findings_where_there_are_enough_subjects(animals,
     recordings = read(pd.concat(rows))
     found = replace(found_in(recordings.plans()), recordings=recordings)
     part = drift_section(found)
-    assert [one.feature for one in part.findings if one.starred] == [f"drift of {name}" for name in starred]
+    assert [one.feature for one in part.findings if one.significant] == [f"drift of {name}" for name in starred]
     assert [row[0] for row in part.section.tables[-1].rows if "*" in row[-2]] == starred
     frame = rate_drift(recordings).frame()
-    assert [one.p_corrected for one in part.findings] == frame["corrected"].tolist()
+    assert [one.p_corrected for one in part.findings] == frame["p_corrected"].tolist()
     by_time = rate_drift(recordings, "time").frame().set_index("behaviour")["times"]
     assert part.frames["rate_drift"].set_index("behaviour")["by_time"].to_dict() == pytest.approx(by_time.to_dict())
     if starred:
