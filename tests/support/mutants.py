@@ -256,7 +256,8 @@ def _first_failure(copy: Path, tests: list[str], limit: float) -> str:
     except subprocess.TimeoutExpired:
         return "no end"
     if done.returncode in NOT_RUN:
-        raise RuntimeError(f"tests are others than when the coverage was measured; delete it\n{done.stdout[-1000:]}{done.stderr[-1000:]}")
+        said = done.stdout[-1000:] + done.stderr[-1000:]
+        raise RuntimeError(f"tests are others than when the coverage was measured; delete it\n{said}")
     if done.returncode == 0:
         return ""
     named = re.search(r"^(?:FAILED|ERROR) (\S.*?)(?: - .*)?$", done.stdout, re.MULTILINE)
