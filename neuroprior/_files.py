@@ -1,4 +1,4 @@
-"""Writing results: CSV and JSON, each to a temporary name first and renamed when whole."""
+"""Files: CSV and JSON, each written to a temporary name first and renamed when whole; and what is too large to read."""
 
 import errno
 import json
@@ -25,6 +25,9 @@ MISSING_LABELS = (
 )  # fmt: skip
 """What stands for no label in tables, in lower case."""
 
+
+MAX_GROWTH, SMALL_BYTES = 100, 2**28
+"""Data that take more memory than this many times what they hold are refused, unless they take few bytes."""
 
 FORMULA = re.compile(r"'*[=+@\t\r-]")
 """How a cell begins that a spreadsheet takes for a formula; an apostrophe before it says that it is a text."""
@@ -203,3 +206,8 @@ def versions(*more: str) -> dict[str, str]:
         with suppress(PackageNotFoundError):
             installed[name] = version(name)
     return installed
+
+
+def grows_too_much(needed: int, held: int) -> bool:
+    """Whether data of `held` bytes, or in a file of so many, must not take `needed` bytes of memory."""
+    return needed > max(MAX_GROWTH * held, SMALL_BYTES)

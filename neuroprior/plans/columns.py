@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from neuroprior._checks import check_memory, check_single_precision, is_whole, warn_caller
-from neuroprior._files import MISSING_LABELS, unquote_cell
+from neuroprior._files import MISSING_LABELS, grows_too_much, unquote_cell
 
 Integers = NDArray[np.integer[Any]]
 Floats = NDArray[np.floating[Any]]
@@ -20,9 +20,6 @@ Place = Callable[[int], str]
 
 MOST_COUNTED = 2**16
 """The most actions that are counted by the largest number among them."""
-
-MAX_GROWTH, SMALL_BYTES = 100, 2**28
-"""Data that take more memory than this many times what they hold are refused, unless they take few bytes."""
 
 LARGEST_INTEGER = 2**62
 LARGEST_FLOAT = float(np.finfo(np.float32).max)
@@ -272,11 +269,6 @@ def check_names(num_actions: int | None, action_names: Sequence[str] | None) -> 
     if num_actions not in (None, len(names)):
         raise ValueError(f"`action_names` must be {num_actions} names, as many as num_actions, got {len(names)}")
     return names
-
-
-def grows_too_much(needed: int, held: int) -> bool:
-    """Whether data of `held` bytes, or in a file of so many, must not take `needed` bytes of memory."""
-    return needed > max(MAX_GROWTH * held, SMALL_BYTES)
 
 
 def count_up_to(largest: int) -> int:

@@ -246,7 +246,7 @@ def test_one_long_plan_among_many_short_ones(tmp_path):
 
 def test_arrays_that_unpack_to_far_more_than_the_file(tmp_path, monkeypatch):
     """The sizes that the archive declares are read before anything is unpacked."""
-    monkeypatch.setattr("neuroprior.plans.columns.SMALL_BYTES", 2**20)
+    monkeypatch.setattr("neuroprior._files.SMALL_BYTES", 2**20)
     zeros = np.zeros((2**10, 2**11), np.uint8)
     np.savez_compressed(tmp_path / "a.npz", actions=zeros[:, : 2**10 + 1])
     with refuses("a.npz: actions:", f"would unpack to {2**10 * (2**10 + 1) + 128:,}", "np.savez"):

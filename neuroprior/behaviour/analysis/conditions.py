@@ -160,7 +160,7 @@ class ConditionComparison:
         """Return a row a feature, those that differ most first.
 
         The columns are `family`, `parts` (a feature's actions), `feature` (its name), `mean, low, high` of each
-        condition (such as `mean, drug`), of two conditions `difference` with `low` and `high`, `p_value`, `corrected`
+        condition (such as `mean, drug`), of two conditions `difference` with `low` and `high`, `p_value`, `p_corrected`
         (for the features of the family, and for the families), `significant` and `statistic`. Durations are geometric
         means and ratios.
         """

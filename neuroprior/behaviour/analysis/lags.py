@@ -75,7 +75,7 @@ class HowFarBack:
         return f"{reached}; {next_one} adds nothing ({bounds})."
 
     def frame(self) -> Any:
-        """Return a row a lag, as a pandas frame: `lag, bits, low, high, p_value, corrected, units`, `adds` or not."""
+        """Return a row a lag, as a pandas frame: `lag, bits, low, high, p_value, p_corrected, units, significant`."""
         import pandas as pd
 
         frame = pd.DataFrame(self.gains).rename(columns={"mean": "bits"})

@@ -51,14 +51,14 @@ class RateDrift:
         first = self.frame().iloc[0]
         return (
             f"RateDrift({len(self.behaviours)} behaviours, {self.num_units} {self.unit}; {first.behaviour}:"
-            f" {first.times:.3g} times, p = {first.corrected:.2g})"
+            f" {first.times:.3g} times, p = {first.p_corrected:.2g})"
         )
 
     def frame(self) -> pd.DataFrame:
         """Return a row a behaviour, the clearest change first.
 
         The columns are `behaviour, bouts`, `times` (the rate at the end, divided by that at the beginning) with its
-        95 % interval `low, high`, `p_value` and `corrected`.
+        95 % interval `low, high`, `p_value` and `p_corrected`.
         """
         values = np.array(self.changes)
         bounds = dict(zip(("times", "low", "high"), np.exp(values[:, :3].T), strict=True))

@@ -41,8 +41,8 @@ MIN_WIDE = 3
 """Columns at least, where each row is a sequence."""
 
 MIN_FRAME_ROWS, MIN_EXCESS = 20, 0.2
-"""Rows at least, and how much more often a cell is as the one above it than as the one before it, at least, where rows
-may be frames and columns subjects."""
+"""Rows at least, and how much more often a cell is as the one above it than as the one before it, beyond chance, where
+rows may be frames and columns subjects."""
 
 
 @dataclass(frozen=True)
@@ -619,7 +619,8 @@ def _choose_layout(sheet: Sheet, roles: Roles, words: Mapping[str, str]) -> None
 def _check_direction(sheet: Sheet, roles: Roles) -> None:
     """Tell columns of subjects, in which a row is a frame, from rows of sequences, where no user says which.
 
-    Names such as "mouse 1" tell it. Else cells of frames are as those above them, those of sequences as those before.
+    Names such as "mouse 1" tell it, and "action 1". Else cells of frames are as those above them, those of sequences as
+    those before, more often than by chance.
 
     Raises:
         ReadingError: it may be either.
@@ -627,8 +628,12 @@ def _check_direction(sheet: Sheet, roles: Roles) -> None:
     if roles.layout != "rows of sequences" or "behaviour" not in roles.inferred or "subject" in roles.at:
         return
     names = roles.at["behaviour"]
+    if _names_behaviours(names):
+        return
     cells = sheet.frame[names].to_numpy(object)
-    excess = _share_equal(cells[1:], cells[:-1]) - _share_equal(cells[:, 1:], cells[:, :-1])
+    chance_above = float(np.mean([_share_alike(column) for column in cells.T]))
+    above = _share_equal(cells[1:], cells[:-1]) - chance_above
+    excess = above - (_share_equal(cells[:, 1:], cells[:, :-1]) - _share_alike(cells.ravel()))
     stems = {plain(match[1] or "") for name in names if (match := STEM_NUMBER.fullmatch(name))}
     timed = _has_equal_steps(sheet, roles)
     if (stems and stems <= set(NAMES["subject"])) or (timed and excess > MIN_EXCESS):
@@ -639,6 +644,12 @@ def _check_direction(sheet: Sheet, roles: Roles) -> None:
             f"{sheet.name}: a row must be a sequence or a frame, got a table that may be either; say whether each"
             f" column is a subject (--columns.subject {span}) or each row a sequence (--columns.behaviour {span})"
         )
+
+
+def _share_alike(cells: Any) -> float:
+    """Return the chance that two of the filled cells are equal."""
+    counts = pd.Series(cells[cells != ""]).value_counts(normalize=True).to_numpy()
+    return float((counts**2).sum())
 
 
 def _share_equal(cells: Any, others: Any) -> float:

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from neuroprior._files import grows_too_much
 from neuroprior.behaviour.reading.names import KNOWN_NAMES, plain
 from neuroprior.behaviour.reading.problems import ReadingError
-from neuroprior.plans.columns import grows_too_much
 
 OTHER_FORMATS = {
     b"MATLAB 5.0 MAT-file": ("MATLAB data", "writetable"),

@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from neuroprior._checks import check_memory, check_single_precision
-from neuroprior._files import written_whole
-from neuroprior.plans.columns import Names, check_file, count_up_to, grows_too_much, warn_of_unused
+from neuroprior._files import grows_too_much, written_whole
+from neuroprior.plans.columns import Names, check_file, count_up_to, warn_of_unused
 from neuroprior.plans.io.assembly import renamed
 from neuroprior.plans.plans import AnyPlans, Plans
 from neuroprior.plans.sequences import constant_context
