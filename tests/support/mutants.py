@@ -210,7 +210,7 @@ def read_reach(folder: Path) -> Reach:
             if any("njit" in ast.unparse(decorator) for decorator in node.decorator_list)
         ]
         reached = data.contexts_by_lineno(str(path))
-        tests[file] = {line: [name.partition("|")[0] for name in names if name] for line, names in reached.items()}
+        tests[file] = {line: [name.rpartition("|")[0] for name in names if name] for line, names in reached.items()}
     return Reach(tests, seconds, sources, compiled)
 
 
