@@ -210,11 +210,11 @@ class Recordings:
         for level in sorted(pd.unique(self.events[factor])):
             inside = (self.events[factor] == level).to_numpy()
             level_recordings = self._replace_events(self.events[inside], self.fragment[inside])
-            spans = self.watched[(levels == level).to_numpy()].reset_index(drop=True)
+            spans = self.watched[levels == level].reset_index(drop=True)
             yield str(level), replace(level_recordings, spans=spans)
 
-    def watched_levels(self, factor: str) -> "pd.Series[Any]":
-        """Return the level of a factor in each row of `watched`: that of the recording's events.
+    def watched_levels(self, factor: str) -> NDArray[Any]:
+        """Return the level of a factor in each row of `watched`, `[rows]`: that of the recording's events.
 
         Where a recording has no events, it is the subject's only level; NaN where this has several or none.
         """
@@ -222,7 +222,7 @@ class Recordings:
         of_subject = self.events.groupby("subject")[factor].agg(["first", "nunique"])
         only = of_subject["first"].where(of_subject["nunique"] == 1)
         spans = self.watched.join(levels, on=KEYS)
-        return spans["level"].fillna(spans["subject"].map(only))
+        return spans["level"].fillna(spans["subject"].map(only)).to_numpy(object)
 
     def time_budget(self) -> pd.DataFrame:
         """Return the share of the watched time that each behaviour takes: rows are subjects, columns behaviours.
