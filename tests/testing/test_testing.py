@@ -391,6 +391,19 @@ class Unsavable(Broken):
         super().__init__()
 
 
+class ReadsFirstContext(MarkovPrior):
+    """Computes all steps of a plan at once from the context of its first."""
+
+    def forward(self, plans, context=None):
+        return super().forward(plans, None if context is None else context[:, :1].expand_as(context))
+
+
+def changing(prior):
+    """The prior, fitted to plans in which what is done depends on a context that changes along them."""
+    context = torch.arange(40).view(8, 5) // 3 % 2
+    return prior.fit(Plans(context + torch.arange(40).view(8, 5) % 2, 3, context=context))
+
+
 @pytest.mark.parametrize(
     ("broken", "message"),
     [
@@ -424,6 +437,7 @@ class Unsavable(Broken):
             "same seed gave other plans|global generator",
         ),
         (partial(Forgetful, bonus=1.0), "saved, loaded"),
+        (lambda: changing(ReadsFirstContext(3, 1, num_contexts=2)), "stepping differs from forward"),
         (ReadsContext, "step: .* `step` is given None where the last context goes on"),
         (Unsavable, "cannot be saved and loaded"),
         (
