@@ -255,7 +255,7 @@ def _first_failure(copy: Path, tests: list[str], limit: float) -> str:
         )
     except subprocess.TimeoutExpired:
         return "no end"
-    if done.returncode in NOT_RUN:
+    if done.returncode in NOT_RUN and "ERROR collecting" not in done.stdout:
         said = done.stdout[-1000:] + done.stderr[-1000:]
         raise RuntimeError(f"tests are others than when the coverage was measured; delete it\n{said}")
     if done.returncode == 0:
