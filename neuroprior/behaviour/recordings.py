@@ -206,12 +206,11 @@ class Recordings:
         if factor is None:
             yield "", self
             return
-        levels = self.watched_levels(factor)
+        watched, levels = self.watched, self.watched_levels(factor)
         for level in sorted(pd.unique(self.events[factor])):
             inside = (self.events[factor] == level).to_numpy()
             level_recordings = self._replace_events(self.events[inside], self.fragment[inside])
-            spans = self.watched[levels == level].reset_index(drop=True)
-            yield str(level), replace(level_recordings, spans=spans)
+            yield str(level), replace(level_recordings, spans=watched[levels == level].reset_index(drop=True))
 
     def watched_levels(self, factor: str) -> NDArray[Any]:
         """Return the level of a factor in each row of `watched`, `[rows]`: that of the recording's events.

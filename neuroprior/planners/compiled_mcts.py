@@ -640,11 +640,11 @@ def _knows(prior: Steppable) -> bool:
     if type(prior) is UniformPrior:
         return True
     if isinstance(prior, HistoryPrior):
-        kind = type(prior)
+        prior_class = type(prior)
         return (
-            kind.start is HistoryPrior.start
-            and kind.step is HistoryPrior.step
-            and kind._outputs_at is HistoryPrior._outputs_at
+            prior_class.start is HistoryPrior.start
+            and prior_class.step is HistoryPrior.step
+            and prior_class._outputs_at is HistoryPrior._outputs_at
         )
     return isinstance(prior, GRUPrior) and not prior.training and prior.is_plain
 

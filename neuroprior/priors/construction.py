@@ -20,10 +20,10 @@ def as_prior(prior: Prior | Mapping[str, Any]) -> Prior:
         return prior
     if not isinstance(prior, Mapping):
         raise ValueError(f"`prior` must be a prior or its description, got {prior!r}")
-    kind = SavedModule.known.find(prior["prior"])
-    if kind is None or not issubclass(kind, Prior):
+    prior_class = SavedModule.known.find(prior["prior"])
+    if prior_class is None or not issubclass(prior_class, Prior):
         raise ValueError(f"{prior['prior']}: not a prior over numbered actions")
-    return kind(**prior["config"])
+    return prior_class(**prior["config"])
 
 
 def described(prior: Prior) -> dict[str, Any]:

@@ -446,9 +446,9 @@ def _sample_one_by_one(
                 if parent is not None:
                     hidden = select_rows(hidden, parent)
                 if plans.row is None and context is None:
-                    rest = stepper.draw_rest(last, hidden, uniform[k + 1 :, span], draw.temperature)
-                    if rest is not None:
-                        actions[span, k + 1 :] = rest
+                    later_actions = stepper.draw_rest(last, hidden, uniform[k + 1 :, span], draw.temperature)
+                    if later_actions is not None:
+                        actions[span, k + 1 :] = later_actions
                         return
                 next_context = None if context is None else context[row[span], t + 1]
                 now, hidden = stepper.step(last, hidden, next_context)

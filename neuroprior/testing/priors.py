@@ -44,8 +44,8 @@ def check_prior(prior: Any, length: int | None = None, num_plans: int = 20_000, 
     """
     if check_by_kind(PRIOR_CHECKS, prior, length, num_plans, seed):
         return
-    kind = f"the class {prior.__name__}" if isinstance(prior, type) else type(prior).__name__
-    require(isinstance(prior, Prior), f"`prior` must be a Prior, as `fit` has to return it, got {kind}")
+    received = f"the class {prior.__name__}" if isinstance(prior, type) else type(prior).__name__
+    require(isinstance(prior, Prior), f"`prior` must be a Prior, as `fit` has to return it, got {received}")
     actions = prior.num_actions
     if length is None:
         length = max((n for n in range(1, 6) if actions**n <= 1024), default=1)

@@ -105,8 +105,8 @@ def individuals(plans: RecordedPlans | Recordings, generator: torch.Generator | 
     weight = total.sum(1) / total.sum()
     probs = _smooth(counts, total)
     distances = np.stack([_distance(probs, row, weight) for row in probs])
-    rest = _smooth(total - counts, total)
-    observed = _distance(probs, rest, weight)
+    probs_of_others = _smooth(total - counts, total)
+    observed = _distance(probs, probs_of_others, weight)
     sizes = counts.sum(-1).astype(np.int64)
 
     def drawn_from(base: Array) -> Array:

@@ -176,7 +176,7 @@ def find_roles(sheet: Sheet, columns: Columns, words: Mapping[str, str]) -> Role
     else:
         _choose_behaviour(sheet, roles, "behaviour" in ranges, closed)
     _choose_layout(sheet, roles, words)
-    if "recording" in roles.inferred and "recording" not in (program.columns if program else ()):
+    if "recording" in roles.at and "recording" not in closed:
         _choose_recordings(sheet, roles)
     _check_direction(sheet, roles)
     if roles.layout == "rows of sequences":
@@ -346,17 +346,12 @@ def _choose_recordings(sheet: Sheet, roles: Roles) -> None:
     """
     chosen: list[str] = []
     subjects = roles.at.get("subject", [])
+    several_rows = len(sheet.frame) > 2 and (not subjects or bool(sheet.frame.duplicated(subjects).any()))
+    may_count = roles.layout != "rows of sequences" and several_rows
     for name in roles.at.pop("recording"):
-        per_subject = sheet.frame.groupby([*subjects, name], sort=False).ngroups
         groups = sheet.frame.groupby([*chosen, name], sort=False).ngroups
         before = sheet.frame.groupby(chosen, sort=False).ngroups if chosen else 0
-        repeated = not subjects or bool(sheet.frame.duplicated(subjects).any())
-        if (
-            roles.layout != "rows of sequences"
-            and len(sheet.frame) > 2
-            and per_subject == len(sheet.frame)
-            and repeated
-        ):
+        if may_count and not sheet.frame.duplicated([*subjects, name]).any():
             where = "of a subject, " if subjects else ""
             roles.notes.append(f"the column {name!r} differs in each row {where}and is not used as recording")
         elif groups > before:
@@ -445,7 +440,7 @@ def _choose_behaviour(sheet: Sheet, roles: Roles, is_range: bool, closed: set[st
             roles.program = SIMBA
         elif indicators[0].lower() == "background":
             roles.program = DEEPETHOGRAM
-    elif run := _labelled_run(frame, free, MIN_WIDE - ("start" in roles.at)):
+    elif run := _labelled_run(frame, free, 2 if "start" in roles.at else MIN_WIDE):
         roles.at["behaviour"], roles.layout = run, "rows of sequences"
     elif (label := _only_label(frame, free)) and roles.at:
         roles.at["behaviour"] = [label]

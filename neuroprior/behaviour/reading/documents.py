@@ -12,15 +12,12 @@ from neuroprior._files import grows_too_much
 from neuroprior.behaviour.reading.names import KNOWN_NAMES, plain
 from neuroprior.behaviour.reading.problems import ReadingError
 
-OTHER_FORMATS = {
-    b"MATLAB 5.0 MAT-file": ("MATLAB data", "writetable"),
-    b"SQLite format 3\0": ("a database", "a query whose result is saved as CSV"),
-    b"\x80\x02": ("a pickle, which could run a program", "frame.to_csv"),
-    b"\x80\x03": ("a pickle, which could run a program", "frame.to_csv"),
-    b"\x80\x04": ("a pickle, which could run a program", "frame.to_csv"),
-    b"\x80\x05": ("a pickle, which could run a program", "frame.to_csv"),
-    b"%PDF": ("a PDF", "the program that made it"),
-}
+OTHER_FORMATS = (
+    ((b"MATLAB 5.0 MAT-file",), "MATLAB data", "writetable"),
+    ((b"SQLite format 3\0",), "a database", "a query whose result is saved as CSV"),
+    ((b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05"), "a pickle, which could run a program", "frame.to_csv"),
+    ((b"%PDF",), "a PDF", "the program that made it"),
+)
 """The first bytes of files that are refused: what they are, and what writes a table instead."""
 
 JSON_FORMS = "a list of records, lists of labels, or an object of these by recording"
@@ -32,8 +29,8 @@ def check_format(content: bytes, label: str) -> None:
     Raises:
         ReadingError: the first bytes are those of such a file.
     """
-    for first, (what, way) in OTHER_FORMATS.items():
-        if content.startswith(first):
+    for beginnings, what, way in OTHER_FORMATS:
+        if content.startswith(beginnings):
             raise ReadingError(f"{label}: the file must be a table, got {what}; write CSV ({way})")
 
 

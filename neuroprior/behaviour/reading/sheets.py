@@ -149,13 +149,13 @@ def _sheets_of_bytes(content: bytes, name: str, label: str, wanted: Sequence[str
     elif content[:8] == b"\x89HDF\r\n\x1a\n":
         yield sheet_of_frame(_read_by_pandas(label, pd.read_hdf, label), label, stem)
     elif content[:6] == b"\x93NUMPY":
-        yield _sheet_without_header(*read_array(content, label), label, stem)
+        yield _sheet_of_document(*read_array(content, label), label, stem)
     elif content.lstrip()[:5] == b"<?xml" and b"<log" in content[:2000]:
         yield _sheet_of_xes(content, label, stem)
     elif content.lstrip()[:9].lower().startswith((b"<!doctype", b"<html", b"<?xml")):
         raise ReadingError(f"{label}: the file must be a table, got a web page or XML")
     elif _is_json(content, name):
-        yield _sheet_without_header(*read_json(_decode(content, label)[0], label), label, stem)
+        yield _sheet_of_document(*read_json(_decode(content, label)[0], label), label, stem)
     else:
         check_format(content, label)
         yield _sheet_of_text(content, label, stem, wanted)
@@ -165,14 +165,16 @@ def _is_json(content: bytes, name: str) -> bool:
     return name.lower().endswith(".json") or re.match(rb"\s*[\[{]\s*[\[{\"]", content) is not None
 
 
-def _sheet_without_header(frame: pd.DataFrame, header: bool, label: str, stem: str) -> Sheet:
-    """Return a frame as a sheet; without a header its columns are numbered from 1."""
-    if header:
-        return sheet_of_frame(frame, label, stem)
-    frame = frame.set_axis([f"column {number}" for number in range(1, 1 + frame.shape[1])], axis=1)
+def _sheet_of_document(frame: pd.DataFrame, header: bool, label: str, stem: str) -> Sheet:
     sheet = sheet_of_frame(frame, label, stem)
+    return sheet if header else _number_columns(sheet)
+
+
+def _number_columns(sheet: Sheet) -> Sheet:
+    """Return a sheet whose file does not name its columns: they are numbered from 1."""
     sheet.header = False
-    sheet.notes.append(f"{label} has no header; its columns are numbered from 1")
+    sheet.notes.append(f"{sheet.name} has no header; its columns are numbered from 1")
+    sheet.frame.columns = pd.Index([f"column {i + 1}" for i in range(sheet.frame.shape[1])])
     return sheet
 
 
@@ -403,12 +405,9 @@ def _sheet_of_cells(
     if at:
         sheet.notes.append(f"the header of {name} is line {lines[at]}; what is above it is not read as rows")
     if header is None:
-        sheet.header = False
-        sheet.notes.append(f"{name} has no header; its columns are numbered from 1")
         sheet.frame = cells.iloc[at:].reset_index(drop=True)
         sheet.lines = lines[at:]
-        sheet.frame.columns = pd.Index([f"column {i + 1}" for i in range(cells.shape[1])])
-        return sheet
+        return _number_columns(sheet)
     body = cells.iloc[at + 1 :].reset_index(drop=True)
     width = max((i for i, cell in enumerate(header, 1) if cell), default=0)
     surplus = body.iloc[:, width:]

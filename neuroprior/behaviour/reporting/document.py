@@ -148,8 +148,8 @@ def results_of(document: Document) -> dict[str, Any]:
     """What `results.json` holds: the rows of each frame, further results, settings and versions."""
     rows = {document.keys.get(name, name): records(frame) for name, frame in document.frames.items()}
     headline = {"headline": [asdict(one) for one in document.headline]} if document.headline else {}
-    rest = {**headline, **document.results, "settings": dict(document.settings), "versions": versions()}
-    return {**rows, **rest}
+    entries = {**headline, **document.results, "settings": dict(document.settings), "versions": versions()}
+    return {**rows, **entries}
 
 
 def write_results(folder: Path, content: dict[str, Any]) -> None:

@@ -245,11 +245,11 @@ def _predictions(mean: Tensor, covariance: Tensor, ridge: Tensor, error: Tensor)
             weights = steady(weights)
         # The mean square of what is left, which with a ridge is more than the conditional variance.
         shared = cross.mT @ weights
-        rest = now - shared - shared.mT + weights.mT @ past_covariance @ weights
-        rest = (rest + rest.mT) / 2
+        residual = now - shared - shared.mT + weights.mT @ past_covariance @ weights
+        residual = (residual + residual.mT) / 2
         # Rounding may leave it slightly indefinite.
-        lifted = (-torch.linalg.eigvalsh(rest)[:, :1]).clamp(min=0) + least
-        lower = torch.linalg.cholesky(rest + torch.diag_embed(lifted))
+        lifted = (-torch.linalg.eigvalsh(residual)[:, :1]).clamp(min=0) + least
+        lower = torch.linalg.cholesky(residual + torch.diag_embed(lifted))
         std = lower.diagonal(dim1=1, dim2=2)
         # x = m + unit @ (std * noise): each dimension's mean given those before it, not given their noise
         coupling = (eye - torch.linalg.inv(lower / std[:, None])).tril(-1)

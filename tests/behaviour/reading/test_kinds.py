@@ -382,14 +382,14 @@ def bouts_of_frames(step: float = 1.0, begin: float = 0.0) -> list[tuple[Any, ..
 def test_a_column_of_labels_for_each_subject(header, times, step, begin, columns, study):
     """A row is a frame: its time, or the user, says so."""
     lines = [f"{time},{x},{y}" for time, x, y in zip(times, *FRAMES, strict=True)]
-    given = columns and {use: name.format("x", "y") for use, name in columns.items()}
-    found = study("\n".join([header.format("x", "y"), *lines]) + "\n", given)
-    assert rows(found) == bouts_of_frames(step, begin)
-    assert "(--columns.behaviour 'x:y' if each row is a sequence)" in str(found.notes)
+    uses = columns and {use: name.format("x", "y") for use, name in columns.items()}
+    recordings = study("\n".join([header.format("x", "y"), *lines]) + "\n", uses)
+    assert rows(recordings) == bouts_of_frames(step, begin)
+    assert "(--columns.behaviour 'x:y' if each row is a sequence)" in str(recordings.notes)
 
 
 def test_whether_a_row_is_a_frame_or_a_sequence(study):
-    """Subjects are told by their names; what may be either is refused, until the user says which it is."""
+    """The names of subjects say it; what may be either is refused, until the user says which it is."""
     lines = [f"{x},{y},{x}" for x, y in zip(*FRAMES, strict=True)]
     mice = study("\n".join(["mouse 2,mouse 5,mouse 9", *lines]) + "\n")
     assert labels(mice) == [[*"abcabc"], [*"cbaba"], [*"abcabc"]]
@@ -444,9 +444,9 @@ def test_documents_are_sequences(content, name, study):
 
 
 def test_an_array_of_labels_is_a_recording(study):
-    found = study(array(np.array([3, 3, 0], np.int16)), name="day 2.npy", merge_repeats=True)
-    assert labels(found) == [["3", "0"]]
-    assert set(found.events["recording"]) == {"day 2"}
+    recordings = study(array(np.array([3, 3, 0], np.int16)), name="day 2.npy", merge_repeats=True)
+    assert labels(recordings) == [["3", "0"]]
+    assert set(recordings.events["recording"]) == {"day 2"}
     with pytest.raises(ValueError, match="whole numbers or texts, got float64"):
         study(array(np.array([0.5, 1.0])), name="f.npy")
     with pytest.raises(ValueError, match="one or two dimensions"):
@@ -491,11 +491,11 @@ def test_times_of_day_may_count_halves(times, hours, study):
 def test_trials_of_one_choice_are_no_recordings(study):
     """A column that differs in each row of a subject counts its trials; one that does not tells its sessions apart."""
     lines = [f"r{1 + row // 6},{1 + row // 3 % 2},{1 + row % 6},{'LRRLLR'[row % 5]},{row % 2}" for row in range(12)]
-    found = study("\n".join(["subj_id,session,trial,choice,reward", *lines]) + "\n")
-    assert labels(found) == [[*"LRR"], [*"LLL"], [*"RRL"], [*"LLR"]]
-    assert found.events["subject"].nunique() == 2
-    found = study("\n".join(["worker_id,trial,picked", *(line[:3] + line[5:-2] for line in lines)]) + "\n")
-    assert labels(found) == [[*"LRRLLL"], [*"RRLLLR"]]
+    recordings = study("\n".join(["subj_id,session,trial,choice,reward", *lines]) + "\n")
+    assert labels(recordings) == [[*"LRR"], [*"LLL"], [*"RRL"], [*"LLR"]]
+    assert recordings.events["subject"].nunique() == 2
+    recordings = study("\n".join(["worker_id,trial,picked", *(line[:3] + line[5:-2] for line in lines)]) + "\n")
+    assert labels(recordings) == [[*"LRRLLL"], [*"RRLLLR"]]
 
 
 def test_what_never_recurs_is_no_behaviour(study):
