@@ -121,9 +121,15 @@ def test_ratios_of_restricted_means_leave_out_a_subject(kind):
         return logs[1] - logs[0]
 
     group = [0 if kind == "within" else (cell[k], treated[k]) for k in range(subjects)]
-    shares = [(group.count(one) - 1) / group.count(one) for one in group]
-    error = sum(share * (change(k) - change(None)) ** 2 for k, share in enumerate(shares)) ** 0.5
-    half = stats.t.ppf(0.975, subjects - len({*group})) * error
+    variances = []
+    for one in {*group}:
+        numbers = [k for k in range(subjects) if group[k] == one]
+        squares = sum((change(k) - change(None)) ** 2 for k in numbers)
+        bouts = np.array([(inside & (unit == k)).sum() for k in numbers], float)
+        variances.append((squares * (len(numbers) - 1) / len(numbers), bouts.sum() ** 2 / (bouts**2).sum() - 1))
+    total = sum(variance for variance, _ in variances)
+    freedom = total**2 / sum(variance**2 / max(number, 1) for variance, number in variances)
+    half = stats.t.ppf(0.975, freedom) * total**0.5
     want = np.exp([change(None), change(None) - half, change(None) + half])
     assert list(result.ratios["rest"]) == pytest.approx(want.tolist())
 

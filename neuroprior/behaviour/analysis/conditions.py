@@ -50,6 +50,9 @@ MOST_FEATURES = {"behaviours": 1000, "transitions": 1000, "sequences": 100, "dur
 LEAST_VARIANCE = 1e-6
 """Of all variance: the least that counts as that within conditions, as units may agree at random."""
 
+ALIKE = 1e-12
+"""The spread of shares, and of logarithms, that is a rounding error."""
+
 MAX_WORK = 5 * 10**8
 """Numbers that permutations may compute, some ten seconds on one core; beyond, fewer are made."""
 
@@ -65,9 +68,10 @@ class ConditionFamily:
         features: int64 `[F, n]`: the actions of each.
         values: float64 `[B, F]`: the number of each block; NaN where there is nothing to take it from.
         means: float64 `[C, F]`: the mean over the units of each condition, with `low` and `high`, its 95 % interval.
-        low, high: float64 `[C, F]`.
+        low, high: float64 `[C, F]`; NaN where all units are alike, as how far others may be from them is unknown.
         difference: float64 `[3, F]`: the mean of the second of two conditions less that of the first, and the ends of
-            its 95 % interval; NaN for more than two conditions. With strata it is adjusted for them, by least squares.
+            its 95 % interval (NaN as above); NaN for more than two conditions. With strata it is adjusted for them, by
+            least squares.
         statistic: float64 `[F]`: between units Welch's t squared, or for more conditions Wald's standardised sum of
             squares; within units the F of repeated measures (for two conditions the paired t squared).
         p_values: float64 `[F]`: by permutation, of each feature alone.
@@ -428,7 +432,7 @@ def _statistics(values: Tensor, design: PermutationDesign, labellings: Tensor) -
     else:
         values = values - _stratum_means(values, torch.ones_like(values), design)
     spread = values.square().mean(0).sqrt()
-    alike = spread <= 1e-12 * values.abs().amax(0).clamp(min=1)
+    alike = spread <= ALIKE * values.abs().amax(0).clamp(min=1)
     values = (values / torch.where(alike, 1, spread)).masked_fill(alike, 0).T.contiguous()
     squares, units = values.square(), len(design.units)
     weights, means = [], []
@@ -471,17 +475,24 @@ def _estimates(numbers: _Numbers, design: PermutationDesign) -> tuple[Tensor, Te
 def _stratified_gap(values: Tensor, weights: Tensor, design: PermutationDesign) -> tuple[Tensor, Tensor, Tensor]:
     """The second of two conditions less the first, within strata; its standard error, and degrees of freedom.
 
-    By weighted least squares with robust errors (Welch and Satterthwaite); without strata the difference of means.
+    By weighted least squares, errors from leaving out one unit at a time; without strata the difference of means. The
+    degrees of freedom are Welch's and Satterthwaite's, of as many units as there would be of equal weights.
     """
     second = design.label.double()[:, None].expand_as(values)
     second = second - _stratum_means(second, weights, design)
     values = values - _stratum_means(values, weights, design)
     scale = (weights * second.square()).sum(0)
     gap = (weights * second * values).sum(0) / scale
-    squares = (weights * second * (values - gap * second) / scale).square()
+    totals = torch.zeros(len(design.strata), weights.shape[1], dtype=torch.double)
+    totals = totals.index_add_(0, design.stratum, weights)[design.stratum]
+    leverage = weights / totals + weights * second.square() / scale
+    squares = (weights * second * (values - gap * second) / scale / (1 - leverage)).square()
     by_condition = torch.stack([design.label == 0, design.label == 1]).double()
-    freedom = by_condition @ (weights > 0).double() - (len(design.strata) + 1) / 2
-    variance = by_condition @ squares * (1 + (len(design.strata) + 1) / 2 / torch.where(freedom > 0, freedom, nan))
+    lost = (len(design.strata) + 1) / 2
+    units = by_condition @ (weights > 0).double()
+    variance = by_condition @ squares * torch.where(units > lost, 1 - lost / units, nan)
+    variance = variance.masked_fill(variance <= ALIKE**2, nan)
+    freedom = (_count_equal(by_condition, weights) - lost).clamp(min=1)
     return gap, variance.sum(0).sqrt(), variance.sum(0).square() / (variance.square() / freedom).sum(0)
 
 
@@ -495,18 +506,23 @@ def _stratum_means(values: Tensor, weights: Tensor, design: PermutationDesign) -
 
 
 def _mean(values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The weighted mean of `[U, F]` over units, its standard error (Cochran 1977, section 6.3), degrees of freedom."""
+    """The weighted mean of `[U, F]` over units, its standard error (jackknife), and degrees of freedom."""
     units, total = (weights > 0).sum(0).double(), weights.sum(0)
     mean = (weights * values).sum(0) / total
-    spread = (weights * (values - mean)).square().sum(0)
-    freedom = torch.where(units > 1, units - 1, nan)
-    return mean, ((freedom + 1) / freedom * spread).sqrt() / total, freedom
+    changes = weights * (values - mean) / (total - weights)
+    error = (changes.square().sum(0) * torch.where(units > 1, 1 - 1 / units, nan)).sqrt()
+    return mean, error, (_count_equal(torch.ones(len(weights), dtype=torch.double), weights) - 1).clamp(min=1)
+
+
+def _count_equal(chosen: Tensor, weights: Tensor) -> Tensor:
+    """`[..., F]`: as how many units of equal weights those count that are `chosen [..., U]` (Kish 1965, 11.7)."""
+    return (chosen @ weights).square() / (chosen @ weights.square())
 
 
 def _half(error: Tensor, freedom: Tensor) -> Tensor:
-    """Half the width of Student's interval; 0 without spread."""
+    """Half the width of Student's interval; NaN without spread."""
     student = torch.from_numpy(np.asarray(stdtrit(freedom.numpy(), 0.975)))
-    return torch.where(error == 0, 0, student * error)
+    return torch.where(error <= ALIKE, nan, student * error)
 
 
 def _predict(

@@ -219,7 +219,10 @@ def transitions(
 
 
 def _interval(cell: Tensor, unit: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """The 95 % interval `[A, A]` of each transition's probability, a ratio of sums over units (Cochran 1977, 6.3).
+    """The 95 % interval `[A, A]` of each transition's probability, which leaves out one unit at a time (jackknife).
+
+    It is Student's on the scale of log odds, with as many degrees of freedom as units would have of equal counts (Kish
+    1965, section 11.7). Of a transition that no other replaced, P(only this one) is p to the number of units at most.
 
     Args:
         cell: int64 `[M]`: from * A + to of each transition.
@@ -231,16 +234,17 @@ def _interval(cell: Tensor, unit: Tensor, size: int) -> tuple[Tensor, Tensor]:
     kinds, kind = cell.unique(return_inverse=True)  # only these have a probability other than 0
     first, row = kinds.div(size, rounding_mode="floor").unique(return_inverse=True)
     counts = (rank * len(kinds) + kind).bincount(minlength=number * len(kinds)).view(number, len(kinds)).double()
-    of_row = counts.new_zeros(number, len(first)).index_add_(1, row, counts)
-    total = of_row.sum(0)[row]
-    prob = counts.sum(0) / total
-    error = (counts - prob * of_row[:, row]).square().sum(0)
-    freedom = (of_row > 0).sum(0)[row].double() - 1
-    student = torch.from_numpy(np.asarray(stdtrit(freedom.clamp(min=1).cpu().numpy(), 0.975))).to(error.device)
-    half = student * (error * (freedom + 1) / freedom).sqrt() / total
-    half = half.masked_fill(freedom < 1, torch.nan)
+    of_row = counts.new_zeros(number, len(first)).index_add_(1, row, counts)[:, row]
+    units, weight = (of_row > 0).sum(0), of_row / of_row.sum(0)
+    prob = counts.sum(0) / of_row.sum(0)
+    changes = (counts / of_row.sum(0) - prob * weight) / (1 - weight)  # 0 / 0 where there is one unit
+    error = (changes.square().sum(0) * (units - 1) / units).sqrt()
+    freedom = (1 / weight.square().sum(0) - 1).clamp(min=1)
+    student = torch.from_numpy(np.asarray(stdtrit(freedom.cpu().numpy(), 0.975))).to(error.device)
+    half, certain = student * error / (prob * (1 - prob)), (prob == 1) & (units > 1)
     low, high = (torch.full((size**2,), torch.nan, dtype=torch.double, device=cell.device) for _ in range(2))
-    low[kinds], high[kinds] = (prob - half).clamp(min=0), (prob + half).clamp(max=1)
+    low[kinds] = torch.where(certain, 0.025 ** (1 / units), torch.sigmoid(torch.logit(prob) - half))
+    high[kinds] = torch.where(certain, 1.0, torch.sigmoid(torch.logit(prob) + half))
     return low.view(size, size), high.view(size, size)
 
 

@@ -99,7 +99,8 @@ def duration_survival(
     where what is expected is the hazard of the stratum, or in paired designs of the subject. Its null distribution is
     that of permuted conditions of whole units (see `PermutationDesign`), so that bouts of a subject may be alike.
     The ratio is of the areas below the two curves: of mean durations, up to the longest bout of a condition where this
-    one was cut off.
+    one was cut off. Its degrees of freedom are Welch's and Satterthwaite's, of as many units in each condition as
+    there would be of equally many bouts (Kish 1965, section 11.7).
     Units count so that each stratum has the same weight under both conditions.
 
     Args:
@@ -232,7 +233,10 @@ def _ratio_of_means(time: Array, ended: NDArray[np.bool_], block: Numbers, desig
     change, group = logs[1] - logs[0], np.zeros(units, np.int64)  # of units that might exchange places
     if design.kind == "between":
         group[unit] = np.unique(cell * 2 + label, return_inverse=True)[1]
-    size = np.bincount(group)
-    share = (size.clip(min=2) - 1) / size
-    half = special.stdtrit(units - len(size), 0.975) * np.sqrt(share[group] @ (change[1:] - change[0]) ** 2)
+    size, bouts = np.bincount(group), np.bincount(unit[block], minlength=units).astype(np.float64)
+    variance = np.bincount(group, (change[1:] - change[0]) ** 2) * (size.clip(min=2) - 1) / size
+    of_group = np.bincount(group, bouts) ** 2 / np.bincount(group, bouts**2).clip(min=1) - 1
+    with np.errstate(invalid="ignore"):  # 0 / 0 without spread
+        freedom = variance.sum() ** 2 / (variance**2 / of_group.clip(min=1)).sum()
+    half = special.stdtrit(freedom, 0.975) * np.sqrt(variance.sum())
     return Interval(*np.exp([change[0], change[0] - half, change[0] + half]).tolist())

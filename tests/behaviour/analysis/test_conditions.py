@@ -224,6 +224,14 @@ def test_all_tests_are_corrected_and_combined():
     assert (corrected <= holm(p_values) + 1e-9).all()
 
 
+def leave_one_out(values, weight):
+    """The weighted mean, the jackknife's error, and degrees of freedom: as many equal weights vary as much, less 1."""
+    mean, units = np.average(values, weights=weight), len(values)
+    without = [np.average(np.delete(values, k), weights=np.delete(weight, k)) for k in range(units)]
+    error = np.sqrt((units - 1) / units * sum((one - mean) ** 2 for one in without))
+    return mean, error, weight.sum() ** 2 / (weight**2).sum() - 1
+
+
 def test_estimates_are_weighted_means_over_animals_with_students_intervals():
     """Animal 0 takes action 1 in 10 of 30 actions, and so on: with n actions an animal has the weight n / (n + 20)."""
     ones, lengths = [10, 10, 3, 30, 20, 6], [30, 20, 6, 60, 30, 12]
@@ -239,16 +247,15 @@ def test_estimates_are_weighted_means_over_animals_with_students_intervals():
     np.testing.assert_allclose(family.values[:, 1], share)
     errors = []
     for k, own in enumerate((slice(0, 3), slice(3, 6))):
-        mean = (weight[own] * share[own]).sum() / weight[own].sum()
-        error = np.sqrt(3 / 2 * (weight[own] ** 2 * (share[own] - mean) ** 2).sum()) / weight[own].sum()
-        half = stats.t.ppf(0.975, 2) * error
+        mean, error, freedom = leave_one_out(share[own], weight[own])
+        half = stats.t.ppf(0.975, freedom) * error
         assert [family.means[k, 1], family.low[k, 1], family.high[k, 1]] == pytest.approx(
             [mean, mean - half, mean + half]
         )
-        errors.append(error**2)
+        errors.append((error**2, freedom))
     gap = float(family.means[1, 1] - family.means[0, 1])
-    freedom = sum(errors) ** 2 / sum(error**2 / 2 for error in errors)
-    half = stats.t.ppf(0.975, freedom) * np.sqrt(sum(errors))
+    variance = sum(square for square, _ in errors)
+    half = stats.t.ppf(0.975, variance**2 / sum(square**2 / freedom for square, freedom in errors)) * np.sqrt(variance)
     assert family.difference[:, 1].tolist() == pytest.approx([gap, gap - half, gap + half])
 
 
@@ -257,11 +264,11 @@ def test_paired_differences_are_weighted_over_animals():
     family = family_of(compare_conditions(plans), "behaviours")
     label, n = np.array([0, 1] * 4), np.array([15, 15, 15, 30, 30, 15, 15, 15])
     gap = np.diff(family.values.numpy().reshape(4, 2, -1), axis=1)[:, 0]
-    weight = 1 / (1 + SMOOTHING / n[label == 0] + SMOOTHING / n[label == 1])[:, None]
-    mean = (weight * gap).sum(0) / weight.sum()
-    error = np.sqrt(4 / 3 * (weight**2 * (gap - mean) ** 2).sum(0)) / weight.sum()
-    half = stats.t.ppf(0.975, 3) * error
-    np.testing.assert_allclose(family.difference, [mean, mean - half, mean + half], atol=1e-12)
+    weight = 1 / (1 + SMOOTHING / n[label == 0] + SMOOTHING / n[label == 1])
+    for place in range(gap.shape[1]):
+        mean, error, freedom = leave_one_out(gap[:, place], weight)
+        half = stats.t.ppf(0.975, freedom) * error
+        np.testing.assert_allclose(family.difference[:, place], [mean, mean - half, mean + half], atol=1e-12)
 
 
 def test_features_are_shares_and_mean_log_durations_by_hand():
@@ -495,11 +502,26 @@ def test_plans_without_actions_and_actions_that_an_animal_never_takes():
     others = [int(g) for g in plans.group[plans.condition == condition].unique() if g != 3]
     taken = (actions == 2)[:, :-1] & (torch.arange(1, actions.shape[1]) < lengths[:, None])
     n = np.array([int(taken[plans.group == animal].sum()) for animal in others])
-    weight, values = (n / (n + SMOOTHING))[:, None], family.values[others][:, after].numpy()
-    mean = (weight * values).sum(0) / weight.sum()
-    half = stats.t.ppf(0.975, 2) * np.sqrt(3 / 2 * (weight**2 * (values - mean) ** 2).sum(0)) / weight.sum()
-    for found_here, due in ((family.means, mean), (family.low, mean - half), (family.high, mean + half)):
-        np.testing.assert_allclose(found_here[condition, after], due)
+    for place in after.nonzero()[:, 0].tolist():
+        mean, error, freedom = leave_one_out(family.values[others, place].numpy(), n / (n + SMOOTHING))
+        half = stats.t.ppf(0.975, freedom) * error
+        ends = [float(one[condition, place]) for one in (family.means, family.low, family.high)]
+        np.testing.assert_allclose(ends, [mean, mean - half, mean + half])
+
+
+def test_where_all_animals_are_alike_there_is_no_interval():
+    """Sequences that no animal of one condition shows, some of the other do: neither 0 nor the difference is sure."""
+    actions = torch.tensor([[0, 1] * 12, [0, 0, 1, 1] * 6, [0, 1, 1] * 8, [0, 1] * 12, [0, 1] * 12, [0, 1] * 12])
+    plans = RecordedPlans(
+        actions.repeat(1, 5),
+        2,
+        group=torch.arange(6),
+        condition=torch.tensor([0, 0, 0, 1, 1, 1]),
+    )
+    family = family_of(compare_conditions(plans), "behaviours")
+    assert family.means[1].tolist() == [0.5, 0.5]
+    assert torch.cat([family.low[1], family.high[1], family.difference[1:].flatten()]).isnan().all()
+    assert torch.cat([family.low[0], family.high[0], family.difference[0]]).isfinite().all()
 
 
 def test_what_never_varies_does_not_differ():

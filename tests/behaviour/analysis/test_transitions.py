@@ -3,12 +3,12 @@
 import itertools
 from collections import Counter
 
+import numpy as np
 import pytest
 import torch
-from scipy import stats
+from scipy import special, stats
 
 from neuroprior import Plans
-from neuroprior._statistics import ratio_difference
 from neuroprior.behaviour import RecordedPlans, transitions
 from neuroprior.behaviour.analysis.transitions import FEWEST_PERMUTATIONS
 from tests.support.chains import markov_plans, markov_probs
@@ -189,7 +189,8 @@ def by_condition() -> RecordedPlans:
     return RecordedPlans(actions, 3, lengths, group=group, condition=condition, **names)
 
 
-def test_intervals_are_those_of_ratios_over_subjects():
+def test_intervals_leave_out_a_subject():
+    """In plain loops, on the scale of log odds."""
     plans = by_condition()
     found = transitions(plans, 9, seeded(0), by="condition")
     frame = found.frame()
@@ -198,9 +199,24 @@ def test_intervals_are_those_of_ratios_over_subjects():
         own = plans if row.condition == "all" else plans[plans.condition == ["saline", "drug"].index(row.condition)]
         per = transitions(own, 1, seeded(0)).group_counts.double()
         a, b = (plans.action_names.index(name) for name in (row[2], row.to))
-        mean, low, high, _ = ratio_difference(per[:, a, b], per[:, a].sum(1))
-        assert (row.probability, row.low, row.high) == pytest.approx((mean, max(low, 0), min(high, 1)))
-        assert row.count == per[:, a, b].sum()
+        times, of_row = per[:, a, b].numpy(), per[:, a].sum(1).numpy()
+        times, of_row = times[of_row > 0], of_row[of_row > 0]
+        share, units = times.sum() / of_row.sum(), len(times)
+        assert (row.count, row.probability) == (times.sum(), pytest.approx(share))
+        without = [np.delete(times, k).sum() / np.delete(of_row, k).sum() for k in range(units)]
+        error = np.sqrt((units - 1) / units * sum((one - share) ** 2 for one in without))
+        freedom = max(of_row.sum() ** 2 / (of_row**2).sum() - 1, 1)
+        half = stats.t.ppf(0.975, freedom) * error / share / (1 - share)
+        assert (row.low, row.high) == pytest.approx(special.expit(special.logit(share) + half * np.array([-1, 1])))
+
+
+def test_of_what_always_follows_the_lower_bound_is_exact():
+    """Three subjects show it with .025 at most where its probability is so low; of one subject nothing is known."""
+    actions = torch.tensor([[0, 1, 0, 1], [0, 1, 1, 1], [0, 1, 0, 1], [1, 0, 1, 0], [2, 2, 2, 2]])
+    found = transitions(Plans(actions, 3, group=torch.tensor([4, 4, 7, 9, 9])), 9, seeded(0))
+    assert [found.low[0, 0, 1], found.high[0, 0, 1]] == pytest.approx([0.025 ** (1 / 3), 1])
+    assert found.low[0, 2, 2].isnan()
+    assert found.high[0, 2, 2].isnan()
 
 
 def test_whole_subjects_are_permuted_between_conditions():
