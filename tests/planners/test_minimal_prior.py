@@ -126,6 +126,7 @@ SPOILED: dict[str, tuple[Callable, str]] = {
     "an array": (lambda logits, state: (logits.numpy(), state), "got ndarray"),
     "no state": (lambda logits, state: logits, "must return logits and a state, got torch.float32"),
     "a state of one row": (lambda logits, state: (logits, (state, state[: len(state) > 1])), "must return a state of"),
+    "a state of nothing": (lambda logits, state: (logits, ()), "must return a state of"),
     "a state that is none": (
         lambda logits, state: (logits, None),
         "rows, a tensor or a tuple of such tensors, got None",

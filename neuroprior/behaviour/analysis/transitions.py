@@ -87,34 +87,40 @@ class Transitions:
     def frame(self) -> pd.DataFrame:
         """Return a row for each transition that occurs, of all and of each group.
 
-        Columns: `subject` or `condition` ("all" for all), `from`, `to`, `count`, `probability`, `low`, `high`,
+        Columns: `subject` or `condition` (`name_of_all` for all), `from`, `to`, `count`, `probability`, `low`, `high`,
         `p_value` (corrected).
         """
         counts = torch.cat([self.counts[None], self.group_counts])
         which, a, b = counts.nonzero(as_tuple=True)
         probs = torch.cat([self.probs()[None], self.group_probs()])
         p_values = torch.cat([torch.full_like(self.cell_p_values[:1], float("nan")), self.cell_p_values])
-        names, groups = np.array(self.action_names, dtype=object), np.array(["all", *self.group_names], dtype=object)
+        names = np.array(self.action_names, dtype=object)
+        groups = np.array([self.name_of_all, *self.group_names], dtype=object)
         columns = {self.by: groups[which.cpu()], "from": names[a.cpu()], "to": names[b.cpu()]}
         numbers = (counts, probs, self.low, self.high, p_values)
         named = zip(("count", "probability", "low", "high", "p_value"), numbers, strict=True)
         return pd.DataFrame(columns | {name: values[which, a, b].cpu().numpy() for name, values in named})
 
-    def graph(self, group: str = "all") -> nx.DiGraph:
+    @property
+    def name_of_all(self) -> str:
+        """What all groups together are called: "all", but where a group is."""
+        return "all groups" if "all" in self.group_names else "all"
+
+    def graph(self, group: str | None = None) -> nx.DiGraph:
         """Return the transitions above chance as a networkx graph, for GraphML, Graphviz and other programs.
 
         An edge is a transition whose interval lies above the share of its second action among all that follow another
         action. Nodes have `count`; edges `weight` (the probability), `low`, `high` and `count`.
 
         Args:
-            group: the name of a group; "all".
+            group: the name of a group; None: all of them.
 
         Raises:
             ValueError: there is no such group.
         """
-        if group not in (names := ["all", *self.group_names]):
-            raise ValueError(f"`group` must be one of {', '.join(names)}, got {group!r}.")
-        number = names.index(group)
+        if group is not None and group not in self.group_names:
+            raise ValueError(f"`group` must be one of {', '.join(self.group_names)}, got {group!r}.")
+        number = 0 if group is None else 1 + list(self.group_names).index(group)
         counts = (self.counts if number == 0 else self.group_counts[number - 1]).double()
         probs, low, high = _row_probs(counts), self.low[number], self.high[number]
         apart = counts.clone().fill_diagonal_(0)

@@ -84,7 +84,12 @@ def read_json(text: str, label: str) -> tuple[pd.DataFrame, bool]:
     ):
         document = member
     if isinstance(document, dict) and {"columns", "data"} <= document.keys():
-        return pd.DataFrame(document["data"], columns=document["columns"]), True
+        try:
+            return pd.DataFrame(document["data"], columns=document["columns"]), True
+        except (TypeError, ValueError) as error:
+            raise ReadingError(f"{label}: the JSON's `data` must fit its `columns`, got {error}") from None
+    if isinstance(document, dict) and {"schema", "data"} <= document.keys():
+        document = document["data"]
     members = [*document.values()] if isinstance(document, dict) else document if isinstance(document, list) else []
     if members and all(isinstance(one, dict) for one in members):
         return (_frame_of_records(members, label) if members is document else pd.DataFrame(document)), True

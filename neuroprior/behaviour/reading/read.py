@@ -277,6 +277,7 @@ def _combine(readings: list[Part], notes: list[str], options: Options) -> Record
     context = list(dict.fromkeys(name for reading in filled for name in reading.roles.at.get("context", [])))
     for name in [*factors, *context]:
         events[name] = events[name].fillna("")
+    first += _notes_on_empty_factors(events, factors)
     unowned = events["subject"].eq("").to_numpy()
     if unowned.any():
         events["subject"] = np.where(unowned, events["recording"], events["subject"])
@@ -322,6 +323,17 @@ def _combine(readings: list[Part], notes: list[str], options: Options) -> Record
     if options.from_ is not None or options.to is not None:
         recordings = recordings.window(options.from_, options.to)
     return recordings
+
+
+def _notes_on_empty_factors(events: pd.DataFrame, factors: list[str]) -> list[str]:
+    """Return a note for each factor that is not known of all recordings."""
+    recordings, notes = events.drop_duplicates(["recording", "subject"]), []
+    for name in factors:
+        unknown = recordings.loc[recordings[name] == "", "subject"]
+        if len(unknown):
+            where = f"{len(unknown):,} of {len(recordings):,} recordings (first of {unknown.iloc[0]!r})"
+            notes.append(f"the factor {name!r} is empty in {where}: nothing is compared by it before these are filled")
+    return notes
 
 
 def _notes_on_twins(events: pd.DataFrame) -> list[str]:

@@ -29,7 +29,7 @@ def transition_section(evaluation: Evaluation) -> Part | None:
     frame = result.frame()
     frames = {"transitions": frame, "transition_test": pd.DataFrame()}
     text = ["The probability of each behaviour after each other one, within sequences."]
-    shown = frame[frame["subject"] == "all"].sort_values("count", ascending=False, kind="stable")[:LISTED]
+    shown = frame[frame["subject"] == result.name_of_all].sort_values("count", ascending=False, kind="stable")[:LISTED]
     columns: dict[str, Column] = {
         "transition": lambda row: f"{row['from']} → {row['to']}",
         "count": "count:,",
@@ -75,12 +75,12 @@ def transition_section(evaluation: Evaluation) -> Part | None:
 
 
 @drawn
-def transition_graph_figure(result: Transitions, group: str = "all") -> Figure:
+def transition_graph_figure(result: Transitions, group: str | None = None) -> Figure:
     """The transitions above chance as arrows between actions on a circle; see `Transitions.graph`.
 
     Args:
         result: of `transitions`.
-        group: whose; "all".
+        group: whose; None: of all.
     """
     graph = result.graph(group)
     names = list(graph.nodes)

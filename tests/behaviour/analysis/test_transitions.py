@@ -244,5 +244,14 @@ def test_the_graph_has_the_transitions_above_chance():
     assert {*graph.edges} == above
     assert ("0", "1") in above
     assert graph.edges["0", "1"]["weight"] == pytest.approx(float(found.probs()[0, 1]))
-    with refuses("`group` must be one of all, "):
+    with refuses("`group` must be one of group 0, "):
         found.graph("nobody")
+
+
+def test_a_subject_that_is_called_all_is_one_of_them():
+    plans = RecordedPlans(
+        torch.tensor([[0, 1, 0], [1, 1, 0]]), 2, group=torch.tensor([0, 1]), group_names=("m1", "all")
+    )
+    frame = transitions(plans, 9).frame()
+    assert frame.groupby("subject")["count"].sum().to_dict() == {"all groups": 4, "m1": 2, "all": 2}
+    assert sorted(transitions(plans, 9).graph("all").nodes(data="count")) == [("0", 0), ("1", 2)]

@@ -423,6 +423,7 @@ def array(values: Any) -> bytes:
         ('{"animal": {"0": "m1", "5": "m2"}, "behaviour": {"0": "a", "5": "b"}}', "f.json"),
         ('{"study": {"animal": ["m1", "m2"], "behaviour": ["a", "b"]}}', "f.json"),
         ('{"columns": ["animal", "behaviour"], "index": [0, 1], "data": [["m1", "a"], ["m2", "b"]]}', "f.txt"),
+        ('{"schema": {}, "data": [{"animal": "m1", "behaviour": "a"}, {"animal": "m2", "behaviour": "b"}]}', "f.json"),
         (array(np.array([("m1", "a"), ("m2", "b")], [("animal", "U2"), ("behaviour", "U1")])), "f.npy"),
     ],
 )
@@ -463,6 +464,7 @@ def test_an_array_of_labels_is_a_recording(study):
         ('{"animal": "m1"', "f.json", "whole JSON"),
         ('{"animal": "m1", "n": 3}', "f.json", "another form"),
         ('[{"labels": [["a"]]}]', "f.json", "deeper lists"),
+        ('{"columns": ["animal", "behaviour"], "data": [["m1", "a", 3]]}', "f.json", "must fit its `columns`"),
         ("[" * 100_000, "f.json", "nested too deep"),
     ],
 )
@@ -506,3 +508,11 @@ def test_what_never_recurs_is_no_behaviour(study):
 
 def test_the_unit_of_durations_alone(study):
     assert study("animal,behaviour,dur_ms\nm1,a,20\nm1,b,7\n").unit == "ms"
+
+
+def test_a_factor_that_is_empty_in_some_recordings_is_noted(study):
+    rows = ["m1,a,drug", "m1,b,drug", "m2,b,", "m2,a,", "m3,a,saline", "m4,b,"]
+    found = study("animal,behaviour,treatment\n" + "\n".join(rows) + "\n")
+    notes = [note for note in found.notes if "'treatment'" in note]
+    assert len(notes) == 1
+    assert "empty in 2 of 4 recordings (first of 'm2')" in notes[0]
