@@ -226,6 +226,11 @@ def _vector(name: str, values: ArrayLike) -> np.ndarray[tuple[int], np.dtype[np.
     return vector
 
 
+def interval_words(low: float, high: float, form: str, before: str = "") -> str:
+    """Return an interval for a table or, with `before`, a sentence: "0.1 to 0.3"; "" where there is none (NaN)."""
+    return "" if np.isnan(low) else f"{before}{low:{form}} to {high:{form}}"
+
+
 def p_words(value: float) -> str:
     """Return a p-value for a sentence: "p = .012", "p < .0001"."""
     if value < 1e-4:

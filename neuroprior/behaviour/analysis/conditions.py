@@ -70,8 +70,8 @@ class ConditionFamily:
         means: float64 `[C, F]`: the mean over the units of each condition, with `low` and `high`, its 95 % interval.
         low, high: float64 `[C, F]`; NaN where all units are alike, as how far others may be from them is unknown.
         difference: float64 `[3, F]`: the mean of the second of two conditions less that of the first, and the ends of
-            its 95 % interval (NaN as above); NaN for more than two conditions. With strata it is adjusted for them, by
-            least squares.
+            its 95 % interval; NaN for more than two conditions, and the ends where all units of both are alike. With
+            strata it is adjusted for them, by least squares.
         statistic: float64 `[F]`: between units Welch's t squared, or for more conditions Wald's standardised sum of
             squares; within units the F of repeated measures (for two conditions the paired t squared).
         p_values: float64 `[F]`: by permutation, of each feature alone.
@@ -491,7 +491,9 @@ def _stratified_gap(values: Tensor, weights: Tensor, design: PermutationDesign) 
     lost = (len(design.strata) + 1) / 2
     units = by_condition @ (weights > 0).double()
     variance = by_condition @ squares * torch.where(units > lost, 1 - lost / units, nan)
-    variance = variance.masked_fill(variance <= ALIKE**2, nan)
+    # Where all units are alike, as where none does a thing, others may differ as much as those of the other condition.
+    reach = by_condition @ (weights * second / scale).square()
+    variance = torch.where(variance <= ALIKE**2, variance.flip(0) * reach / reach.flip(0), variance)
     freedom = (_count_equal(by_condition, weights) - lost).clamp(min=1)
     return gap, variance.sum(0).sqrt(), variance.sum(0).square() / (variance.square() / freedom).sum(0)
 

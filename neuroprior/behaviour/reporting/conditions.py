@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import pandas as pd
 import torch
 
-from neuroprior._statistics import LEVEL, p_words
+from neuroprior._statistics import LEVEL, interval_words, p_words
 from neuroprior.behaviour.analysis.conditions import (
     ConditionComparison,
     ConditionFamily,
@@ -94,8 +94,8 @@ def _feature_findings(result: ConditionComparison, features: pd.DataFrame, unit:
         if two:
             effect, low, high = row["difference"], row["low"], row["high"]
             by = f"{effect:.3g} times" if of_time else f"difference {100 * effect:+.3g} %"
-            bounds = f"{scale * low:{'' if of_time else '+'}.3g} to {scale * high:{'' if of_time else '+'}.3g}"
-            sentence += f": {by}, 95 % interval {bounds}"
+            form = ".3g" if of_time else "+.3g"
+            sentence += f": {by}" + interval_words(scale * low, scale * high, form, ", 95 % interval ")
         sentence += f"; {p_words(p_corrected)}."
         name = f"{family}: {row['feature']}"
         p = float(row["p_value"])
@@ -113,10 +113,8 @@ def _pair_findings(pairs: pd.DataFrame) -> list[Finding]:
         of_time = row["family"] == "durations"
         by = f"{row['difference']:.3g} times" if of_time else f"difference {row['difference']:+.3g}"
         p_corrected = row["p_corrected"]
-        sentence = (
-            f"{pair[0].upper()}{pair[1:]}, {row['feature']}: {by}, 95 % interval {row['low']:.3g} to {row['high']:.3g};"
-            f" {p_words(p_corrected)}."
-        )
+        interval = interval_words(row["low"], row["high"], ".3g", ", 95 % interval ")
+        sentence = f"{pair[0].upper()}{pair[1:]}, {row['feature']}: {by}{interval}; {p_words(p_corrected)}."
         name, family = f"{row['feature']}, {pair}", f"{row['family']}, {pair}"
         estimate = (row["difference"], row["low"], row["high"], float(row["p_value"]))
         starred = bool(row["significant"])
@@ -232,7 +230,7 @@ def _feature_table(result: ConditionComparison, features: pd.DataFrame) -> Table
         columns[f"{second}\nagainst {first}"] = lambda row: (
             f"{row.difference:{_sign(row)}.3g}" + " times" * (not _sign(row))
         )
-        columns["95 % interval"] = lambda row: f"{row.low:{_sign(row)}.3g} to {row.high:{_sign(row)}.3g}"
+        columns["95 % interval"] = lambda row: interval_words(row.low, row.high, f"{_sign(row)}.3g")
     columns["p"] = lambda row: p_text(row.p_corrected) + "*" * row.significant
     shown = features[:LISTED]
     caption = (
@@ -260,7 +258,7 @@ def _pair_table(result: ConditionComparison, pairs: pd.DataFrame) -> Table:
         "conditions": lambda row: f"{row['second']}\nagainst {row['first']}",
         "feature": "feature",
         "difference": lambda row: f"{row.difference:{_sign(row)}.3g}" + " times" * (not _sign(row)),
-        "95 % interval": lambda row: f"{row.low:{_sign(row)}.3g} to {row.high:{_sign(row)}.3g}",
+        "95 % interval": lambda row: interval_words(row.low, row.high, f"{_sign(row)}.3g"),
         "p": lambda row: p_text(row.p_corrected) + "*" * row.significant,
     }
     number = max(LISTED // len(result.contrasts), 1)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.cluster.hierarchy import dendrogram, linkage
 from scipy.spatial.distance import squareform
 
-from neuroprior._statistics import ENOUGH_UNITS, LEVEL, p_words
+from neuroprior._statistics import ENOUGH_UNITS, LEVEL, interval_words, p_words
 from neuroprior.behaviour.analysis.comparison import too_few
 from neuroprior.behaviour.analysis.individuality import Individuality, individuality
 from neuroprior.behaviour.analysis.individuals import (
@@ -55,7 +55,7 @@ def individual_section(evaluation: Evaluation) -> Part | None:
     columns: dict[str, Column] = {
         "individual": "individual",
         "from the others": "distance:.3f",
-        "95 % interval": lambda row: f"{row.low:.3f} to {row.high:.3f}",
+        "95 % interval": lambda row: interval_words(row.low, row.high, ".3f"),
         "by chance": "by_chance:.3f",
         "differs most in": "differs_in",
     }

@@ -5,7 +5,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from neuroprior._statistics import mean_interval
+from neuroprior._statistics import interval_words, mean_interval
 from neuroprior.behaviour.analysis.rate_drift import overlap
 from neuroprior.behaviour.recordings import KEYS, Recordings
 from neuroprior.behaviour.reporting.document import Column, table
@@ -43,7 +43,7 @@ def recording_section(evaluation: Evaluation) -> Part | None:
     percent: dict[str, Column] = {
         "behaviour": "behaviour",
         "% of the time": lambda row: f"{100 * row.share:.1f}",
-        "95 % interval": lambda row: "" if np.isnan(row.low) else f"{100 * row.low:.1f} to {100 * row.high:.1f}",
+        "95 % interval": lambda row: interval_words(100 * row.low, 100 * row.high, ".1f"),
         "subjects": "subjects",
     }
     if budget["condition"].ne("").any():

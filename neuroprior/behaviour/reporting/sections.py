@@ -9,7 +9,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from neuroprior._statistics import ENOUGH_UNITS, LEVEL, p_words
+from neuroprior._statistics import ENOUGH_UNITS, LEVEL, interval_words, p_words
 from neuroprior.behaviour.analysis.comparison import ACTIONS, never_occur, never_taken, too_few, unit_name, units
 from neuroprior.behaviour.analysis.drift import by_group, by_plan, by_position
 from neuroprior.behaviour.analysis.lags import how_far_back
@@ -189,7 +189,7 @@ def lag_section(evaluation: Evaluation) -> Part | None:
         columns: dict[str, Column] = {
             "lag": "lag",
             "bits": "bits:.4f",
-            "95 % interval": lambda row: f"{row.low:.4f} to {row.high:.4f}",
+            "95 % interval": lambda row: interval_words(row.low, row.high, ".4f"),
             "p": lambda row: p_text(row.p_corrected) + "*" * row.significant,
         }
         caption = f"Bits that the behaviour k steps back adds, over {result.unit}."
@@ -229,7 +229,7 @@ def motif_section(evaluation: Evaluation) -> Part | None:
         "count": "count:,",
         "expected": "expected:,.1f",
         "ratio": "ratio:.2f",
-        "95 % interval": lambda row: f"{row.low:.2f} to {row.high:.2f}",
+        "95 % interval": lambda row: interval_words(row.low, row.high, ".2f"),
         "p": lambda row: p_text(row.p_corrected),
     }
     few = too_few(plans)
@@ -289,7 +289,7 @@ def drift_section(evaluation: Evaluation) -> Part | None:
     columns: Mapping[str, Column] = {
         "test": "test",
         "estimate": "mean:+.3f",
-        "95 % interval": lambda row: "" if pd.isna(row["mean"]) else f"{row.low:+.3f} to {row.high:+.3f}",
+        "95 % interval": lambda row: interval_words(row.low, row.high, "+.3f"),
         "p": "p_value:.2g",
     }
     caption = f"Bits of {model.label}; intervals over {evaluation.unit}."
@@ -335,7 +335,7 @@ def _rate_table(rates: pd.DataFrame, evaluation: Evaluation) -> Table:
         "behaviour": "behaviour",
         "bouts": "bouts:,",
         "end / beginning": "times:.3g",
-        "95 % interval": lambda row: f"{row.low:.3g} to {row.high:.3g}",
+        "95 % interval": lambda row: interval_words(row.low, row.high, ".3g"),
         "p": lambda row: p_text(row.p_corrected) + "*" * row.significant,
     }
     caption = (

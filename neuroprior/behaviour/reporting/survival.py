@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from neuroprior._statistics import LEVEL, p_words
+from neuroprior._statistics import LEVEL, interval_words, p_words
 from neuroprior.behaviour.durations.survival import DurationSurvival
 from neuroprior.behaviour.reporting.document import Column, table
 from neuroprior.behaviour.reporting.drawing import (
@@ -48,7 +48,7 @@ def survival_findings(result: DurationSurvival, few: str, unit: str) -> list[Fin
         else:
             first, second = curves
             sentence = f"Bouts of {name} last {effect:.3g} times as long under {second} as under {first}"
-            sentence += f", 95 % interval {low:.3g} to {high:.3g}"
+            sentence += interval_words(low, high, ".3g", ", 95 % interval ")
         sentence += f"; log-rank test, {p_words(corrected)}."
         feature, starred = f"survival of {name}", corrected < LEVEL and not few
         estimate = (effect, low, high, p, corrected)
@@ -63,8 +63,9 @@ def survival_table(result: DurationSurvival, few: str) -> Table:
     columns |= {name.replace(", ", ",\n"): f"{name}:.3g" for name in frame.columns if name.startswith("median")}
     caption = "Medians of bouts, of which some were cut off by the end of watching (Kaplan-Meier)."
     if result.ratios:
-        columns["ratio"] = lambda row: f"{row.ratio:.3g} ({row.low:.3g} to {row.high:.3g})"
-        caption += " ratio: of mean durations, the second by the first, with its 95 % interval."
+        columns["ratio"] = "ratio:.3g"
+        columns["95 % interval"] = lambda row: interval_words(row.low, row.high, ".3g")
+        caption += " ratio: of mean durations, the second by the first."
     if result.tests and not few:
         columns["p"] = lambda row: (
             "" if np.isnan(row.p_corrected) else p_text(row.p_corrected) + "*" * (row.p_corrected < LEVEL)

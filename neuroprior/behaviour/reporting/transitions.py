@@ -6,6 +6,7 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
 
+from neuroprior._statistics import interval_words
 from neuroprior.behaviour.analysis.comparison import too_few
 from neuroprior.behaviour.analysis.transitions import Transitions, transitions
 from neuroprior.behaviour.reporting.document import Column, table
@@ -34,7 +35,7 @@ def transition_section(evaluation: Evaluation) -> Part | None:
         "transition": lambda row: f"{row['from']} → {row['to']}",
         "count": "count:,",
         "probability": "probability:.3f",
-        "95 % interval": lambda row: "" if pd.isna(row.low) else f"{row.low:.3f} to {row.high:.3f}",
+        "95 % interval": lambda row: interval_words(row.low, row.high, ".3f"),
     }
     over = "subjects" if len(result.groups) > 1 else "sequences"
     tables = [table(shown, columns, f"The commonest; intervals over {over}.", "Transitions")]

@@ -510,18 +510,21 @@ def test_plans_without_actions_and_actions_that_an_animal_never_takes():
 
 
 def test_where_all_animals_are_alike_there_is_no_interval():
-    """Sequences that no animal of one condition shows, some of the other do: neither 0 nor the difference is sure."""
-    actions = torch.tensor([[0, 1] * 12, [0, 0, 1, 1] * 6, [0, 1, 1] * 8, [0, 1] * 12, [0, 1] * 12, [0, 1] * 12])
-    plans = RecordedPlans(
-        actions.repeat(1, 5),
-        2,
-        group=torch.arange(6),
-        condition=torch.tensor([0, 0, 0, 1, 1, 1]),
-    )
+    """In their mean; that of the difference takes the other condition's spread for theirs, as equal variances would."""
+    half = torch.tensor([0, 1] * 12)
+    actions = torch.stack([half, torch.tensor([0, 0, 0, 1] * 6), torch.tensor([0, 1, 1] * 8), half, half, half, half])
+    plans = RecordedPlans(actions.repeat(1, 5), 2, group=torch.arange(7), condition=(torch.arange(7) > 2).long())
     family = family_of(compare_conditions(plans), "behaviours")
     assert family.means[1].tolist() == [0.5, 0.5]
-    assert torch.cat([family.low[1], family.high[1], family.difference[1:].flatten()]).isnan().all()
-    assert torch.cat([family.low[0], family.high[0], family.difference[0]]).isfinite().all()
+    assert torch.cat([family.low[1], family.high[1]]).isnan().all()
+    variance = float(family.values[:3, 0].var())
+    freedom = (1 / 3 + 1 / 4) ** 2 / (1 / 3**2 / 2 + 1 / 4**2 / 3)
+    width = stats.t.ppf(0.975, freedom) * np.sqrt(variance / 3 + variance / 4)
+    gap = float(0.5 - family.values[:3, 0].mean())
+    assert family.difference[:, 0].tolist() == pytest.approx([gap, gap - width, gap + width])
+    alike = family_of(compare_conditions(replace(plans, actions=plans.actions[[1, 1, 1, 3, 3, 3, 3]])), "behaviours")
+    assert alike.difference[0].tolist() == pytest.approx([-0.25, 0.25])
+    assert alike.difference[1:].isnan().all()
 
 
 def test_what_never_varies_does_not_differ():
