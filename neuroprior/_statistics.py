@@ -14,6 +14,8 @@ mean: if one seed in ten fails, ten seeds contain no failure in a third of all c
 
 Exceptions are intervals of what is no mean: `share_interval` (Wilson) for a share of independent yes-or-no trials,
 those of counts (`motifs`) and rank correlations (`drift`), and, in the comparison of priors, of medians and best ones.
+Where units count unequally (transitions, features of conditions, how long bouts last), the error is that of leaving out
+one unit at a time, and the degrees of freedom are those of as many units as there would be of equal weights.
 """
 
 from typing import Any, NamedTuple

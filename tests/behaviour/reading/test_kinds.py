@@ -398,6 +398,7 @@ def test_whether_a_row_is_a_frame_or_a_sequence(study):
         study(text)
     assert labels(study(text, {"subject": "p3:p8"})) == labels(mice)
     assert labels(study(text, {"behaviour": "p3:p8"}))[:4] == [[*"aca"], [*"aca"], [*"aca"], [*"bcb"]]
+    assert labels(study(text, {"behaviour": "p3:p5"}))[:4] == [[*"ac"], [*"ac"], [*"ac"], [*"bc"]]
     # A cell may be as the one above it since nearly all of its column are alike.
     routes = [f"a,{'ab'[row % 2]},{'ba'[row % 3 % 2]},b" for row in range(24)]
     assert labels(study("\n".join(["w1,w2,w3,w4", *routes]) + "\n"))[1] == [*"abab"]

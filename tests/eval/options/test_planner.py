@@ -123,6 +123,9 @@ def test_beginning_in_a_mode(phases):
         assert (path == mode).all()
     assert all(prior.state_dict()[name].equal(values) for name, values in before.items())
     assert prior.switching == "context"
+    prior.first = prior.first.view(3, phases).index_fill(0, torch.tensor(2), 0.0).flatten()
+    first = prior.beginning_in(2).first  # in a mode that is never the first, all phases are as probable
+    assert first.tolist() == pytest.approx([0.0] * 2 * phases + [1 / phases] * phases)
 
 
 def test_priors_and_modes_that_do_not_fit():

@@ -329,3 +329,11 @@ def test_what_occurred_is_expected_as_in_the_whole_table(order, num_contexts):
     expected = chains.totals(longest)
     found = chains.entry_log_probs(expected)
     torch.testing.assert_close(found, chains.log_probs(expected)[counts.row, :, counts.action])
+
+
+@pytest.mark.parametrize("contexts", [None, 2])
+def test_one_mode_is_a_chain_however_many_phases_it_has(contexts):
+    plans = some_plans(contexts=contexts)
+    one, three = (SwitchingPrior(3, 1, 1, contexts, phases=phases, **SHORT).fit(plans) for phases in (1, 3))
+    torch.testing.assert_close(three.log_prob(plans), one.log_prob(plans))
+    check_prior(three)
