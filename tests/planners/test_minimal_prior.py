@@ -79,6 +79,27 @@ def test_planning(kind_of_planner, kind):
     assert same(*(planner.plan(world, state, seeded(1)) for planner in planners))
 
 
+class Counting(Minimal):
+    """It counts how often it is asked for a step."""
+
+    steps = 0
+
+    def step(self, action, state):
+        self.steps += 1
+        return super().step(action, state)
+
+
+@pytest.mark.parametrize("kind", [None, *WORLDS])
+@pytest.mark.parametrize("num_plans", [30, 2000])
+def test_nothing_is_asked_after_the_last_action(kind, num_plans):
+    prior, world = Counting(CHAIN.log_probs), WORLDS.get(kind)
+    if world is None:
+        sample(prior, num_plans, 4, generator=seeded(1))
+    else:
+        sample_in_world(prior, world, world.reset(7, seeded(0)), num_plans, 4, generator=seeded(1))
+    assert prior.steps == 3
+
+
 def test_what_does_not_fit_is_refused():
     with refuses("context", "none"):
         sample(CHAIN, 10, 4, torch.zeros(10, dtype=torch.long))
