@@ -199,16 +199,20 @@ def test_two_observers_in_two_files_are_noted(study, tmp_path):
     ]
 
 
-@pytest.mark.parametrize("subjects", [("", ""), (",m1", ",m2")], ids=["unknown", "known"])
-def test_recordings_of_one_name_in_two_files_are_two_unless_their_subjects_are_known(subjects, study, tmp_path):
+@pytest.mark.parametrize(
+    ("subjects", "due"),
+    [
+        (("", ""), ["a day 1/a day 1", "a day 2/a day 2", "b day 1/b day 1", "b day 2/b day 2"]),
+        ((",m1", ",m2"), ["m1/day 1", "m1/day 2", "m2/day 1", "m2/day 2"]),
+    ],
+    ids=["unknown", "known"],
+)
+def test_recordings_of_one_name_in_two_files_are_two_unless_their_subjects_are_known(subjects, due, study, tmp_path):
     for name, subject, label in zip("ab", subjects, ("rest", "walk"), strict=True):
         rows = [f"{day},{label},{start}{subject}" for day in ("day 1", "day 2") for start in (1, 2, 4)]
         header = "session,behaviour,start" + ",animal" * bool(subject)
         (tmp_path / f"{name}.csv").write_text("\n".join([header, *rows]) + "\n")
     found = read([tmp_path / "a.csv", tmp_path / "b.csv"])
-    days = ["a day 1", "a day 2", "b day 1", "b day 2"] if not subjects[0] else ["day 1", "day 2"] * 2
-    assert [name for name, _ in found.events.groupby(["subject", "recording"]).size().index] == (
-        days if not subjects[0] else ["m1", "m1", "m2", "m2"]
-    )
-    assert list(found.events.drop_duplicates(["recording", "subject"])["recording"]) == days
+    recordings = found.events.drop_duplicates(["recording", "subject"])
+    assert list(recordings["subject"] + "/" + recordings["recording"]) == due
     assert any("files' names are put before" in note for note in found.notes) == (not subjects[0])
