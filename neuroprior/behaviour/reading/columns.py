@@ -9,25 +9,30 @@ import numpy as np
 import pandas as pd
 
 from neuroprior.behaviour.reading.names import (
+    ANIMALS,
     DEEPETHOGRAM,
+    HOUSINGS,
     NAMES,
+    PERIODS,
     PROGRAMS,
     SIMBA,
     STEM_NUMBER,
     SUMMARY,
+    SURE_SEPARATORS,
     WORDS,
     Program,
     plain,
 )
 from neuroprior.behaviour.reading.problems import Problems, ReadingError
 from neuroprior.behaviour.reading.sheets import Sheet
-from neuroprior.behaviour.reading.times import MISSING_TIMES, count_times, read_times
+from neuroprior.behaviour.reading.times import MISSING_TIMES, YEAR_FIRST, count_times, read_times
 
 NOT_USED = "none"
 """Stands for a column's name: no column has this use."""
 
 INDICATORS = frozenset(("0", "1", "", "-1", "true", "false", "0.0", "1.0", "-1.0"))
 MONTH = re.compile(r"(jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec)[a-z]*[._\- ]?(\d{2}|\d{4})", re.IGNORECASE)
+DATE_INSIDE = r"\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}:\d{2}:\d{2}"
 NO_BEHAVIOURS = re.compile(r"(low[_ ]prob|in zone|result|probability|arena|zone)", re.IGNORECASE)
 """Columns of zeros and ones that programs write beside those of behaviours."""
 
@@ -176,7 +181,9 @@ def find_roles(sheet: Sheet, columns: Columns, words: Mapping[str, str]) -> Role
     else:
         _choose_behaviour(sheet, roles, "behaviour" in ranges, closed)
     _choose_layout(sheet, roles, words)
-    if "recording" in roles.at and "recording" not in closed:
+    if program is None and roles.layout != "rows of sequences":
+        _fill_down(sheet, roles)
+    if "recording" not in closed and roles.layout != "rows of sequences":
         _choose_recordings(sheet, roles)
     _check_direction(sheet, roles)
     if roles.layout == "rows of sequences":
@@ -265,6 +272,19 @@ def _drop_empty(sheet: Sheet, roles: Roles) -> None:
             del roles.at[use]
 
 
+def _fill_down(sheet: Sheet, roles: Roles) -> None:
+    """Let what stands in the first row of a subject, recording or level alone, as in merged cells, go on below it."""
+    for name in dict.fromkeys(name for use in ("recording", "subject", "factors") for name in roles.at.get(use, [])):
+        column = sheet.frame[name]
+        given = column[column != ""]
+        empty = len(column) - len(given)
+        is_repeated = (given.shift() == given).any()  # cells that are written in each row may be forgotten in some
+        if not len(given) or column.iloc[0] == "" or is_repeated or empty < len(column) / 3:
+            continue
+        sheet.frame[name] = column.where(column != "").ffill()
+        roles.notes.append(f"the column {name!r} is filled where its values begin, and each is read to go on below it")
+
+
 def _drop_index(sheet: Sheet, roles: Roles) -> None:
     """Leave out columns without a name that count the rows or are empty."""
     for name in list(sheet.frame.columns):
@@ -293,7 +313,13 @@ def _guess_roles(sheet: Sheet, roles: Roles) -> None:
             roles.at = {"start": [names[0]], "stop": [names[1]], "behaviour": [names[2]]}
             roles.notes.append(f"{sheet.name} is read as labels of Audacity: start, stop, label")
             return
-    clocks = [name for name in names if frame[name].str.fullmatch(r"-?(\d+:)?\d+:\d+([.,]\d+)?").all()]
+    kinds = (r"-?(\d+:)?\d+:\d+([.,]\d+)?", YEAR_FIRST)
+    clocks = [name for name in names if any(frame[name].str.fullmatch(kind).all() for kind in kinds)]
+    if len(names) == 1 and frame[names[0]].str.contains(DATE_INSIDE).mean() > 0.9:
+        raise ReadingError(
+            f"{sheet.name}: a row must be cells with one separator, below a header, got a text with a date,"
+            f" {frame[names[0]].iloc[0]!r}"
+        )
     if clocks:
         raise ReadingError(
             f"{sheet.name}: the file must have a header, got data in its first line; name columns by number, such as"
@@ -333,8 +359,11 @@ def _find_use(sheet: Sheet, roles: Roles, use: str, words: Mapping[str, str]) ->
         elif candidates and not kept:
             roles.notes.append(f"the column {candidates[0]!r} is empty, and not used as {use}")
         elif use == "subject" and not kept:
-            ids = [name for name in sheet.frame if plain(name).endswith(" id") and name not in roles.used()]
-            kept = [name for name in ids if sheet.frame[name].duplicated().any()] if len(ids) == 1 else []
+            free = [name for name in sheet.frame if name not in roles.used() and sheet.frame[name].duplicated().any()]
+            ids = [name for name in free if plain(name).endswith(" id")]
+            fallback = (*ANIMALS, *(HOUSINGS if "recording" not in roles.at else ()))
+            named = [name for name in free if plain(name) in fallback and not _is_indicator(sheet.frame[name])]
+            kept = ids if len(ids) == 1 else named
     if kept:
         roles.infer(use, kept if use in ("factors", "context", "recording") else kept[:1])
 
@@ -342,22 +371,46 @@ def _find_use(sheet: Sheet, roles: Roles, use: str, words: Mapping[str, str]) ->
 def _choose_recordings(sheet: Sheet, roles: Roles) -> None:
     """Keep the columns that tell recordings apart: the first, and those that divide its recordings.
 
-    Notes and leaves out columns that differ in each row of a subject, such as trials of one choice.
+    Days come first within which sessions are numbered anew. Notes and leaves out columns that differ in each row of a
+    subject or of a recording, such as trials of one choice.
     """
     chosen: list[str] = []
-    subjects = roles.at.get("subject", [])
-    several_rows = len(sheet.frame) > 2 and (not subjects or bool(sheet.frame.duplicated(subjects).any()))
-    may_count = roles.layout != "rows of sequences" and several_rows
-    for name in roles.at.pop("recording"):
+    subjects, candidates = roles.at.get("subject", []), roles.at.pop("recording", [])
+    may_count = len(sheet.frame) > 2 and (not subjects or bool(sheet.frame.duplicated(subjects).any()))
+    behaviour = sheet.frame[roles.at["behaviour"]]
+    recur = bool(behaviour.duplicated().mean() >= 0.5)  # where none does, each may be a sequence
+    for name in [*_periods(sheet, roles, candidates), *candidates]:
         groups = sheet.frame.groupby([*chosen, name], sort=False).ngroups
         before = sheet.frame.groupby(chosen, sort=False).ngroups if chosen else 0
-        if may_count and not sheet.frame.duplicated([*subjects, name]).any():
-            where = "of a subject, " if subjects else ""
+        if may_count and not sheet.frame.duplicated([*subjects, *(chosen if recur else []), name]).any():
+            where = "of a recording, " if chosen else "of a subject, " if subjects else ""
             roles.notes.append(f"the column {name!r} differs in each row {where}and is not used as recording")
         elif groups > before:
             chosen.append(name)
     if chosen:
-        roles.at["recording"] = chosen
+        roles.infer("recording", chosen)
+
+
+def _periods(sheet: Sheet, roles: Roles, recordings: list[str]) -> list[str]:
+    """Return the columns of days, weeks or blocks that divide recordings: whose times lie upon one another, if any."""
+    others = [name for use, names in roles.at.items() if use != "factors" for name in names]
+    known = PERIODS if all(plain(name).startswith("trial") for name in recordings) else PERIODS[:-1]  # blocks of trials
+    periods = [name for name in sheet.frame if plain(name) in known and name not in [*others, *recordings]]
+    keys = [*roles.at.get("subject", []), *recordings]
+    if "start" not in roles.at:
+        return [name for name in periods if 1 < sheet.frame[name].nunique() < len(sheet.frame)]
+    texts = sheet.frame[roles.at["start"][-1]].to_numpy(object)
+    times = read_times(texts, "start", sheet.place, Problems(), separator=sheet.separator).values
+    return [name for name in periods if recordings and _lie_upon_one_another(sheet.frame, keys, name, times)]
+
+
+def _lie_upon_one_another(frame: Any, keys: list[str], name: str, times: Any) -> bool:
+    """Return whether the times of the values of a column overlap within `keys`, as those of days numbered anew do."""
+    spans = frame.assign(**{"\1": times}).groupby([*keys, name], sort=False)["\1"].agg(["min", "max"]).dropna()
+    spans = spans.reset_index().assign(key=lambda rows: rows.groupby(keys, sort=False).ngroup())
+    spans = spans.sort_values(["key", "min"], kind="stable")
+    before = spans.groupby("key")["max"].cummax().groupby(spans["key"]).shift()
+    return bool((spans["min"] < before).any())
 
 
 def _add_dates(sheet: Sheet, roles: Roles) -> None:
@@ -434,7 +487,11 @@ def _choose_behaviour(sheet: Sheet, roles: Roles, is_range: bool, closed: set[st
         raise ReadingError(f"{sheet.name}: {roles.program.name}, must have a column of labels ({wanted}), got none")
     elif usual:
         roles.at["behaviour"] = ([name for name in usual if plain(name) != "name"] or usual)[:1]
-    elif (indicators := _indicator_columns(frame, free)) and not (len(indicators) == 1 and _only_label(frame, free)):
+    elif (
+        (indicators := _indicator_columns(frame, free))
+        and not (len(indicators) == 1 and _only_label(frame, free))
+        and ("stop" not in roles.at or _are_bins(sheet, roles))  # else flags of visits
+    ):
         roles.at["behaviour"], roles.layout = indicators, "columns of behaviours"
         if any(name.startswith("Probability_") for name in free):
             roles.program = SIMBA
@@ -442,7 +499,7 @@ def _choose_behaviour(sheet: Sheet, roles: Roles, is_range: bool, closed: set[st
             roles.program = DEEPETHOGRAM
     elif run := _labelled_run(frame, free, 2 if "start" in roles.at else MIN_WIDE):
         roles.at["behaviour"], roles.layout = run, "rows of sequences"
-    elif (label := _only_label(frame, free)) and roles.at:
+    elif label := _only_string(frame, free) or (roles.at and _only_label(frame, free)):
         roles.at["behaviour"] = [label]
     else:
         uses = "; ".join(f"{use} is {', '.join(names)}" for use, names in roles.at.items())
@@ -544,17 +601,32 @@ def _labelled_run(frame: Any, free: list[str], min_columns: int) -> list[str]:
     """Return the longest run of neighbouring columns that share labels, which are texts and no numbers."""
     best: list[str] = []
     run: list[str] = []
+    labels = {name: set(pd.unique(frame[name])) - {""} for name in free}
     for name in free:
-        texts = pd.unique(frame[name][frame[name] != ""])
-        is_text = len(texts) > 0 and pd.to_numeric(pd.Series(texts, dtype=object), errors="coerce").isna().mean() > 0.5
-        if not is_text:
+        numbers = pd.to_numeric(pd.Series(list(labels[name]), dtype=object), errors="coerce")
+        if not labels[name] or numbers.isna().mean() <= 0.5:
             run = []
         elif run and _share_labels(frame, [run[-1], name]):
             run = [*run, name]
         else:
             run = [name]
         best = run if len(run) > len(best) else best
-    return best if len(best) >= min_columns else []
+    if len(best) < min_columns:
+        return []
+    # A neighbour that shows few of their labels is one of them.
+    common, first, last = set().union(*(labels[name] for name in best)), free.index(best[0]), free.index(best[-1])
+    while first > 0 and len(labels[free[first - 1]] & common) >= 0.5 * max(len(labels[free[first - 1]]), 1):
+        first -= 1
+    while last + 1 < len(free) and len(labels[free[last + 1]] & common) >= 0.5 * max(len(labels[free[last + 1]]), 1):
+        last += 1
+    return free[first : last + 1]
+
+
+def _only_string(frame: Any, free: list[str]) -> str | None:
+    """Return the only column whose cells are sequences with a separator that no word holds; None for several."""
+    mark = "|".join(map(re.escape, SURE_SEPARATORS))
+    strings = [name for name in free if len(frame) and frame[name].str.contains(mark, regex=True).mean() > 0.5]
+    return strings[0] if len(strings) == 1 else None
 
 
 def _only_label(frame: Any, free: list[str]) -> str | None:
@@ -663,6 +735,15 @@ def _has_equal_steps(sheet: Sheet, roles: Roles) -> bool:
     same = np.diff(sheet.frame.groupby(groups, sort=False).ngroup()) == 0 if groups else np.ones(len(times) - 1, bool)
     steps = np.diff(times)[same]
     return len(steps) > 1 and bool((np.isclose(steps, np.nanmedian(steps), rtol=0.02) & (steps > 0)).mean() > 0.9)
+
+
+def _are_bins(sheet: Sheet, roles: Roles) -> bool:
+    """Return whether all rows take equally long, as bins of time do."""
+    start, stop = (
+        read_times(sheet.frame[roles.at[use][-1]].to_numpy(object), use, sheet.place, Problems()).values
+        for use in ("start", "stop")
+    )
+    return len(start) > 1 and bool(np.isclose(stop - start, np.nanmedian(stop - start), rtol=0.02).mean() > 0.9)
 
 
 def _note_unused(sheet: Sheet, roles: Roles, words: Mapping[str, str]) -> None:

@@ -20,7 +20,7 @@ OTHER_FORMATS = (
 )
 """The first bytes of files that are refused: what they are, and what writes a table instead."""
 
-JSON_FORMS = "a list of records, lists of labels, or an object of these by recording"
+JSON_FORMS = "a list of records, lists of labels, or an object of these, or of bouts by behaviour, by recording"
 
 
 def check_format(content: bytes, label: str) -> None:
@@ -91,8 +91,18 @@ def read_json(text: str, label: str) -> tuple[pd.DataFrame, bool]:
     if isinstance(document, dict) and {"schema", "data"} <= document.keys():
         document = document["data"]
     members = [*document.values()] if isinstance(document, dict) else document if isinstance(document, list) else []
+    if members is not document and members and all(map(_are_bouts, members)):
+        bouts = [
+            {"recording": name, "behaviour": behaviour, "start": start, "stop": stop}
+            for name, behaviours in document.items()
+            for behaviour, spans in behaviours.items()
+            for start, stop in spans
+        ]
+        return pd.DataFrame(bouts, columns=["recording", "behaviour", "start", "stop"]), True
     if members and all(isinstance(one, dict) for one in members):
-        return (_frame_of_records(members, label) if members is document else pd.DataFrame(document)), True
+        frame = _frame_of_records(members, label) if members is document else pd.DataFrame(document)
+        if not frame.map(lambda cell: isinstance(cell, dict | list)).any(axis=None):
+            return frame, True
     if members and all(map(_are_labels, members)):
         if members is document:
             return _frame_of_lists(members, label), False
@@ -102,6 +112,14 @@ def read_json(text: str, label: str) -> tuple[pd.DataFrame, bool]:
     if members is document and _are_labels(members):
         return pd.DataFrame({0: members}), False
     raise ReadingError(f"{label}: the JSON must hold {JSON_FORMS}, got another form")
+
+
+def _are_bouts(value: Any) -> bool:
+    """Return whether a value is an object of lists, by behaviour, of starts with their stops."""
+    return isinstance(value, dict) and all(
+        isinstance(spans, list) and all(isinstance(span, list) and len(span) == 2 for span in spans)
+        for spans in value.values()
+    )
 
 
 def _are_labels(value: Any) -> bool:

@@ -4,10 +4,46 @@ import re
 import unicodedata
 from typing import NamedTuple
 
-UNIT_IN_BRACKETS = re.compile(
-    r"\s*[(\[](s|sec|secs|seconds|ms|msec|min|h|hh:mm:ss(.ms)?|frames?|hz|mg|mg/kg)[)\]]\s*$", re.I
+TIME_UNITS = {
+    "s": "s|secs?|seconds?|sf", "ms": "ms|msecs?|milliseconds?", "us": "us|µs|μs|microseconds?",
+    "min": "min|mins|minutes?", "h": "h|hrs?|hours?",
+}  # fmt: skip
+"""Units of time, and how names of columns write them."""
+
+ANY_UNIT = "|".join(TIME_UNITS.values())
+UNIT_IN_BRACKETS = re.compile(rf"\s*[(\[]({ANY_UNIT}|hh:mm:ss(.ms)?|frames?|hz|mg|mg/kg)[)\]]\s*$", re.I)
+UNIT_AT_END = re.compile(rf",?\s[/,]?\s*({ANY_UNIT}|hh mm ss ms|hh mm ss|ss msec|seconds since start)$")
+
+KINDS_OF_SUBJECTS = (
+    "subject",
+    "animal",
+    "mouse",
+    "rat",
+    "bird",
+    "individual",
+    "participant",
+    "person",
+    "patient",
+    "child",
+    "user",
+    "player",
+    "tier",
+    "proband",
+    "vp",
+    "respondent",
+    "student",
+    "customer",
+    "visitor",
+    "worker",
 )
-UNIT_AT_END = re.compile(r"\s(s|sec|secs|seconds|sf|ms|hh mm ss ms|hh mm ss|ss msec|seconds since start)$")
+ANIMALS = ("monkey", "dog", "cat", "fish", "fly", "pig", "cow", "sheep", "goat", "horse", "hen", "larva", "worm", "bee")
+HOUSINGS = ("cage", "tank", "box", "chamber")
+"""Columns that tell subjects apart where no other does; housings where no column tells recordings apart either."""
+
+KEYS_OF_SUBJECTS = ("id", "no", "nr", "number", "name", "code", "#", "tag", "rfid")
+
+PERIODS = ("date", "datum", "day", "week", "visit", "block")
+"""Columns within which sessions may be numbered anew."""
 
 NAMES: dict[str, tuple[str, ...]] = {
     "behaviour": (
@@ -22,9 +58,10 @@ NAMES: dict[str, tuple[str, ...]] = {
         "subject", "subject id", "subjects", "animal", "animal id", "mouse", "mouse id", "rat", "rat id", "bird",
         "bird id", "individual", "individual id", "focal", "focal animal", "focal subject", "participant",
         "participant id", "person", "person id", "id", "pid", "ind", "individu", "tier", "case concept name", "case id",
-        "case", "idhous", "subject name", "tier id",
-        "subj", "subj id", "sub", "user", "user id", "player", "player id", "patient", "patient id", "child",
-        "child id", "actor", "initiator", "proband", "sujet", "sujeto",
+        "case", "idhous",
+        "subj", "subj id", "sub", "actor", "initiator", "sujet", "sujeto", *KINDS_OF_SUBJECTS,
+        *(f"{kind} {key}" for kind in (*KINDS_OF_SUBJECTS, *ANIMALS) for key in KEYS_OF_SUBJECTS),
+        *(f"id {kind}" for kind in (*KINDS_OF_SUBJECTS, *ANIMALS)), "rfid", "id no",
     ),
     "recording": (
         "recording", "recording id", "session", "session id", "observation", "observation id", "video", "video name",
@@ -34,7 +71,8 @@ NAMES: dict[str, tuple[str, ...]] = {
     ),
     "start": (
         "start", "start time", "onset", "onset time", "begin", "begin time", "start timestamp", "from", "time relative",
-        "time", "timestamp", "time timestamp", "times", "t", "trial time", "recording time", "second", "frame",
+        "time", "timestamp", "time timestamp", "times", "t", "ts", "t start",
+        "trial time", "recording time", "second", "frame",
         "frame index", "frame number", "frame id", "frames", "bin", "time bin", "scan",
         "beginn", "anfang", "von", "zeit", "debut", "start frame",
         "begin frame", "onset frame", "time relative hmsf", "time absolute hms", "date time", "datetime",
@@ -42,7 +80,8 @@ NAMES: dict[str, tuple[str, ...]] = {
         "start of event", "scan time", "epoch", "heure", "hora", "temps", "tiempo", "datum", "date",
     ),
     "stop": (
-        "stop", "stop time", "end", "end time", "offset", "offset time", "finish", "to", "ende", "bis", "fin",
+        "stop", "stop time", "end", "end time", "t stop", "t end", "offset", "offset time", "finish",
+        "to", "ende", "bis", "fin",
         "end timestamp", "stop timestamp", "endzeit", "stopp", "event end", "end of event",
         "complete timestamp", "end frame", "stop frame", "offset frame",
     ),
@@ -69,10 +108,11 @@ def plain(name: str) -> str:
     """Return a column's name in lower case, without accents, punctuation between words, and unit.
 
     Example:
-        >>> plain("Start (s)"), plain("case:concept:name"), plain("onset_s")
-        ('start', 'case concept name', 'onset')
+        >>> plain("Start (s)"), plain("case:concept:name"), plain("onset_min"), plain("AnimalID")
+        ('start', 'case concept name', 'onset', 'animal id')
     """
-    letters = unicodedata.normalize("NFKD", str(name).strip().lower())
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", str(name).strip())
+    letters = unicodedata.normalize("NFKD", words.lower())
     short = UNIT_IN_BRACKETS.sub("", "".join(letter for letter in letters if not unicodedata.combining(letter)))
     short = re.sub(r"[\s_.:\-]+", " ", short).strip()
     return UNIT_AT_END.sub("", short)
@@ -155,8 +195,11 @@ WORDS = {
 STEM_NUMBER = re.compile(r"(.*?[^\d.])?[._\- ]?(\d+)")
 """A name that ends in a number: its stem, if any, and the number."""
 
-SUMMARY = re.compile(r"\b(?:total|mean|median|average|std|sd|number|frequency|occurr?ences)\b")
+SUMMARY = re.compile(r"\b(?:total|mean|median|average|std|sd|number of|frequency|occurr?ences)\b|^number$")
 """Occurs in names of columns that sum events up."""
+
+SURE_SEPARATORS = (" > ", "->", "|", ";")
+"""Separators of behaviours in a sequence in one cell that stand in no behaviour's name."""
 
 TOTALS = ("total", "totals", "sum", "gesamt", "summe")
 """What stands for a behaviour in a row that sums up those above it, in lower case."""

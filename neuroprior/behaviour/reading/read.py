@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from neuroprior._files import MISSING_LABELS
 from neuroprior.behaviour.reading.columns import NOT_USED, Columns, find_roles
 from neuroprior.behaviour.reading.frames import melt_subjects
 from neuroprior.behaviour.reading.layouts import LAYOUTS
@@ -19,7 +20,7 @@ from neuroprior.behaviour.reading.options import Options
 from neuroprior.behaviour.reading.problems import Problems, ReadingError
 from neuroprior.behaviour.reading.sheets import Sheet, find_files, read_sheets, sheet_of_frame
 from neuroprior.behaviour.reading.table import JOIN, MAX_OVERLAP, SECONDS, Part, Table, overlapping
-from neuroprior.behaviour.recordings import KEYS, Recordings, Source
+from neuroprior.behaviour.recordings import KEYS, Recordings, Source, near_names
 
 MIN_EVENTS, MAX_SHARE_OF_LABELS = 20, 0.5
 """Events at least, of which this share at most may have a label of their own: what never recurs is no behaviour."""
@@ -277,7 +278,7 @@ def _combine(readings: list[Part], notes: list[str], options: Options) -> Record
     context = list(dict.fromkeys(name for reading in filled for name in reading.roles.at.get("context", [])))
     for name in [*factors, *context]:
         events[name] = events[name].fillna("")
-    first += _notes_on_empty_factors(events, factors)
+    first += _read_levels(events, factors)
     unowned = events["subject"].eq("").to_numpy()
     if unowned.any():
         events["subject"] = np.where(unowned, events["recording"], events["subject"])
@@ -325,10 +326,16 @@ def _combine(readings: list[Part], notes: list[str], options: Options) -> Record
     return recordings
 
 
-def _notes_on_empty_factors(events: pd.DataFrame, factors: list[str]) -> list[str]:
-    """Return a note for each factor that is not known of all recordings."""
+def _read_levels(events: pd.DataFrame, factors: list[str]) -> list[str]:
+    """Empty the cells of factors that hold a word for missing; note those not known, and levels nearly alike."""
+    for name in factors:
+        events[name] = events[name].where(~events[name].str.lower().isin(MISSING_LABELS), "")
     recordings, notes = events.drop_duplicates(["recording", "subject"]), []
     for name in factors:
+        for level, others in near_names(sorted(pd.unique(recordings[name]))).items():
+            notes += [
+                f"the levels {level!r} and {other!r} of {name!r} are nearly alike" for other in others if level < other
+            ]
         unknown = recordings.loc[recordings[name] == "", "subject"]
         if len(unknown):
             where = f"{len(unknown):,} of {len(recordings):,} recordings (first of {unknown.iloc[0]!r})"

@@ -6,12 +6,19 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from neuroprior.behaviour.reading.names import SEQUENCE_MISSING, plain
+from neuroprior.behaviour.reading.names import SEQUENCE_MISSING, SURE_SEPARATORS, plain
 from neuroprior.behaviour.reading.table import Part, Table
 
 STATE_AND_DURATION = re.compile(r"\(?([^(),]+),\s*(\d+(?:\.\d+)?)\)?")
-SEPARATORS = (" > ", "->", "-", "|", ";", ",", " ", "/")
+SEPARATORS = (*SURE_SEPARATORS, "-", ",", " ", "/")
 """Separators of behaviours in a sequence in one cell."""
+
+LIST = r"\[.*\]|\(.*\)|\{.*\}"
+"""A list that a program has written as a text."""
+
+CALLED_SEQUENCES = ("sequence", "seq", "sequences", "string", "song")
+MIN_LETTERS, MIN_RECURRENCE = 5, 4
+"""Letters of a sequence, and how often each occurs, in the mean at least, where letters are behaviours."""
 
 MIN_SEPARATED = 0.3
 """Share of cells with a separator, at least, for cells to be sequences."""
@@ -49,6 +56,17 @@ def rows_of_sequences(table: Table) -> Part:
     return reading
 
 
+def _are_letters(texts: Any) -> bool:
+    """Return whether texts are strings of letters or digits that are behaviours: no text recurs, but letters do."""
+    together = "".join(texts)
+    return bool(
+        texts.str.fullmatch(r"[^\W\d_]+|\d+").all()
+        and texts.str.len().mean() >= MIN_LETTERS
+        and texts.nunique() >= 0.9 * len(texts)
+        and len(together) >= MIN_RECURRENCE * len(set(together))
+    )
+
+
 def _best_separator(texts: Any, separators: list[str]) -> str:
     """Return the separator by which texts have the fewest different pieces, such as the space in "self-groom rear"."""
     pieces = {one: len({word.strip() for text in texts for word in text.split(one)}) for one in separators}
@@ -74,17 +92,23 @@ def strings_of_sequences(table: Table) -> Part | None:
     filled = filled.str.replace(r"([^\s/()-]+)/(\d+(?:\.\d+)?)(?=-|$)", r"(\1,\2)", regex=True)
     cells = cells.where(cells == "", filled.reindex(cells.index))
     timed = filled.str.fullmatch(r"\(?[^(),]+,\s*\d+(\.\d+)?\)?(\s*-\s*\(?[^(),]+,\s*\d+(\.\d+)?\)?)*")
-    is_sequence = plain(names[0]) in ("sequence", "seq", "sequences") or not table.sheet.header
-    separator = ""
+    is_sequence = plain(names[0]) in CALLED_SEQUENCES or not table.sheet.header
+    separator, letters = "", False
     if timed.mean() <= 0.9:
+        if filled.str.fullmatch(LIST).all():
+            is_sequence, filled = True, filled.str.replace(r"^.|.$|['\"]", "", regex=True).str.strip()
+            filled = filled.str.replace(r"\s*,\s*|\s+", ",", regex=True)
+            cells = cells.where(cells == "", filled.reindex(cells.index))
         keys = pd.Series(list(zip(table.recording, table.subject, strict=True)))
-        alone = is_sequence or ("subject" in table.roles.at and keys.is_unique)
         counts = {one: float(filled.str.contains(one, regex=False).mean()) for one in SEPARATORS}
+        alone = is_sequence or ("subject" in table.roles.at and keys.is_unique)
+        alone = alone or (counts[" > "] > 0.9 or counts["->"] > 0.9)
         separator = max(SEPARATORS, key=lambda one: counts[one])
         separator = _best_separator(filled, [one for one in SEPARATORS if counts[one] >= MIN_SEPARATED]) or separator
-        if not alone or counts[separator] < MIN_SEPARATED:
+        letters = is_sequence and counts[separator] == 0 and _are_letters(filled)
+        if not alone or (counts[separator] < MIN_SEPARATED and not letters):
             return None
-        pieces = [word for text in filled for word in text.split(separator)]
+        pieces = [word for text in filled for word in (text if letters else text.split(separator))]
         if len(set(pieces)) >= 0.9 * len(pieces) and len(filled) > 1:
             return None
     table.unit = "steps"
@@ -97,7 +121,7 @@ def strings_of_sequences(table: Table) -> Part | None:
         pieces_of = (
             STATE_AND_DURATION.findall(text)
             if not separator
-            else [(word.strip(), "1") for word in text.split(separator)]
+            else [(word.strip(), "1") for word in (text if letters else text.split(separator))]
         )
         rows += [row] * len(pieces_of)
         labels += [word.strip() for word, _ in pieces_of]
@@ -105,6 +129,7 @@ def strings_of_sequences(table: Table) -> Part | None:
     row_of = np.array(rows, np.int64)
     ends = pd.Series(lengths).groupby(row_of).cumsum().to_numpy().astype(np.float64)
     what = "states with durations" if not separator else f"behaviours parted by {separator!r}"
+    what = "each letter a behaviour" if letters else what
     table.notes.append(f"each cell of {names[0]!r} is read as a sequence, {what}")
     named = table.labels(np.array(["" if word in SEQUENCE_MISSING else word for word in labels], dtype=object))
     return table.part(row_of, named, (ends - np.array(lengths)).astype(np.float64), ends)

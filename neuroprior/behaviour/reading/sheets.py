@@ -199,10 +199,12 @@ def _sheets_of_zip(content: bytes, name: str, label: str, stem: str, wanted: Seq
     if "[Content_Types].xml" in members or b"opendocument" in kind:
         yield from _sheets_of_workbook(content, label, stem, wanted)
         return
-    tables = [member for member in members if not member.startswith("__MACOSX")]
-    for member in tables:
+    tables = [member for member in members if not any(part[0] in "._" for part in Path(member).parts)]
+    names = [Path(member).name for member in tables]
+    for member, member_name in zip(tables, names, strict=True):
         called = label if len(tables) == 1 else f"{label}, {member}"
-        yield from _sheets_of_bytes(archive.read(member), Path(member).name, called, wanted)
+        once = names.count(member_name) == 1
+        yield from _sheets_of_bytes(archive.read(member), member_name if once else member, called, wanted)
 
 
 def _sheets_of_workbook(content: bytes, label: str, stem: str, wanted: Sequence[str]) -> Iterator[Sheet]:

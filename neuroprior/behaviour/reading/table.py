@@ -9,7 +9,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from neuroprior.behaviour.reading.columns import Roles
-from neuroprior.behaviour.reading.names import NO_SUBJECT, TOTALS, plain
+from neuroprior.behaviour.reading.names import NO_SUBJECT, TIME_UNITS, TOTALS, plain
 from neuroprior.behaviour.reading.options import Options
 from neuroprior.behaviour.reading.problems import Problems
 from neuroprior.behaviour.reading.sheets import Sheet
@@ -21,7 +21,7 @@ Integers = NDArray[np.int64]
 JOIN = "|"
 """Between the labels of several columns."""
 
-SECONDS = {"s": 1.0, "ms": 0.001}
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0, "h": 3600.0}
 """Seconds of the units of time that can be converted."""
 
 UNIT_CELL = re.compile(r"\(?(s|ms|sec|seconds|min|frames|h|)\)?", re.IGNORECASE)
@@ -395,9 +395,8 @@ def _unit_of_name(name: str) -> str:
     low = name.lower()
     if "frame" in low or "image" in low:
         return "frames"
-    if re.search(r"\b(ms|msec|milliseconds?)\b", low.replace("_", " ")):
-        return "ms"
-    return "s" if re.search(r"\b(s|sec|secs|seconds?|sf)\b", low.replace("_", " ")) else ""
+    words = low.replace("_", " ")
+    return next((unit for unit, names in TIME_UNITS.items() if re.search(rf"\b({names})\b", words)), "")
 
 
 def overlapping(unit: Integers, start: Floats, stop: Floats) -> Integers:

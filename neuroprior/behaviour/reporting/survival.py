@@ -41,16 +41,17 @@ def survival_findings(result: DurationSurvival, few: str, unit: str) -> list[Fin
     findings = []
     for name, (p, corrected) in result.tests.items():
         curves = {level: curve for (behaviour, level), curve in result.curves.items() if behaviour == name}
-        effect, low, high = result.ratios.get(name, (None, None, None))
-        if effect is None:
+        ratio = result.ratios.get(name)
+        if ratio is None:
             medians = [f"{one.median:.3g}{f' {unit}' * bool(unit)} under {level}" for level, one in curves.items()]
             sentence = f"How long a bout of {name} lasts differs between conditions: medians {listed(medians)}"
         else:
             first, second = curves
-            sentence = f"Bouts of {name} last {effect:.3g} times as long under {second} as under {first}"
-            sentence += interval_words(low, high, ".3g", ", 95 % interval ")
+            sentence = f"Bouts of {name} last {ratio.mean:.3g} times as long under {second} as under {first}"
+            sentence += interval_words(ratio.low, ratio.high, ".3g", ", 95 % interval ")
         sentence += f"; log-rank test, {p_words(corrected)}."
         feature, starred = f"survival of {name}", corrected < LEVEL and not few
+        effect, low, high = ratio or (None, None, None)
         estimate = (effect, low, high, p, corrected)
         findings.append(Finding(f"survival: {name}", "survival", feature, *estimate, starred, sentence))
     return findings

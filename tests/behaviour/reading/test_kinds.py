@@ -2,6 +2,7 @@
 
 import io
 import re
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -517,3 +518,91 @@ def test_a_factor_that_is_empty_in_some_recordings_is_noted(study):
     notes = [note for note in found.notes if "'treatment'" in note]
     assert len(notes) == 1
     assert "empty in 2 of 4 recordings (first of 'm2')" in notes[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "due"),
+    [
+        # Sessions that are numbered anew each day, with and without times; trials of one choice in sessions and blocks.
+        (
+            "animal,day,session,time,behaviour\n"
+            "a,1,1,0,x\na,1,1,9,y\na,1,2,0,z\na,1,2,7,x\na,2,1,1,y\na,2,1,8,y\na,2,2,2,z\na,2,2,4,z\n",
+            ["xy", "zx", "yy", "zz"],
+        ),
+        ("animal,day,behaviour\na,1,x\na,1,y\na,2,z\na,2,x\nb,1,y\nb,1,y\n", ["xy", "zx", "yy"]),
+        ("id,session,trial,choice\na,1,1,l\na,1,2,l\na,1,3,r\na,2,1,r\na,2,2,l\nb,1,1,r\n", ["llr", "rl", "r"]),
+        ("id,block,trial,choice\na,1,1,l\na,1,2,l\na,2,1,r\na,2,2,r\nb,1,1,r\n", ["ll", "rr", "r"]),
+        ("id,session,block,trial,choice\na,1,A,1,l\na,1,B,2,l\na,1,A,3,r\na,2,B,1,r\na,2,B,2,r\n", ["llr", "rr"]),
+        ("id,session,trial_number,choice\na,1,1,l\na,1,2,l\na,2,1,r\nb,1,1,r\nb,1,2,l\n", ["ll", "r", "rl"]),
+        # Times without days go on, so that a new day is no new recording.
+        ("animal,day,session,time,behaviour\na,1,s,0,x\na,1,s,9,y\na,2,s,20,z\na,2,s,27,x\n", ["xyzx"]),
+        # Subjects by other names.
+        ("AnimalID,time,behaviour\nm1,0,x\nm2,1,y\nm1,2,x\nm2,3,z\n", ["xx", "yz"]),
+        ("Tier-Nr.;Zeit;Verhalten\nm1;0;x\nm2;1;y\nm1;2;x\nm2;3;z\n", ["xx", "yz"]),
+        ("Participant name,time,behaviour\nm1,0,x\nm2,1,y\nm1,2,x\nm2,3,z\n", ["xx", "yz"]),
+        ("dog,time,behaviour\nm1,0,x\nm2,1,y\nm1,2,x\nm2,3,z\n", ["xx", "yz"]),
+        ("cage,time,behaviour\nm1,0,x\nm2,1,y\nm1,2,x\nm2,3,z\n", ["xx", "yz"]),
+        # Merged cells.
+        ("animal,session,behaviour\na,1,x\n,,y\n,2,z\n,,x\nb,1,x\n,,x\n", ["xy", "zx", "xx"]),
+        # Sequences as lists, paths, letters, and beside another text.
+        ("id,labels\na,\"['x', 'y', 'x']\"\nb,\"['z', 'x']\"\n", ["xyx", "zx"]),
+        ("id,sequence\na,[1 2 1]\nb,[2  2]\n", ["121", "22"]),
+        ("visitor,path\na,x > y > x\nb,z > x\nb,x > z\n", ["xyx", "zx", "xz"]),
+        ("id,sequence\na,XYXXYZXXYX\nb,YXYYXZYYXX\nc,ZZYXX\n", ["XYXXYZXXYX", "YXYYXZYYXX", "ZZYXX"]),
+        ("id,codes,outcome\na,x|y|x,alive\nb,y|x,dead\nc,x|z,dead\nd,y|y,alive\n", ["xyx", "yx", "xz", "yy"]),
+        # Columns of subjects, of which one shows few of the labels of the others.
+        ("time,Anna,Ben,Carl\n0,x,z,x\n1,x,z,x\n2,y,x,x\n3,y,x,z\n4,x,x,z\n", ["xyx", "zx", "xz"]),
+    ],
+)
+def test_recordings_are_told_apart(text, due, study):
+    assert list(map("".join, labels(study(text)))) == due
+
+
+@pytest.mark.parametrize(
+    ("header", "ends", "stops", "unit"),
+    [
+        ("Start (s),Duration (min)", (1, 1.5), (60, 150), "s"),
+        ("start_min,Stop (s)", (90, 4200), (1.5, 70), "min"),
+        ("Onset / h,Offset (h)", (1, 61.5), (1, 61.5), "h"),
+        ("t_start [ms],t_stop [ms]", (1, 61.5), (1, 61.5), "ms"),
+        ("Onset (µs),Duration (ms)", (1, 1.5), (1000, 1560), "us"),
+    ],
+)
+def test_units_of_starts_and_of_stops(header, ends, stops, unit, study):
+    found = study(f"animal,behaviour,{header}\na,x,0,{ends[0]}\na,y,60,{ends[1]}\n")
+    assert tuple(found.events["stop"]) == pytest.approx(stops)
+    assert found.unit == unit
+
+
+def test_words_for_missing_are_no_levels_and_levels_alike_are_noted(study):
+    found = study("id,treatment,behaviour\n1,drug,x\n2,Drug,x\n3,NA,y\n4,n/a,x\n5,saline,y\n")
+    assert list(found.events["treatment"]) == ["drug", "Drug", "", "", "saline"]
+    assert "the levels 'Drug' and 'drug' of 'treatment' are nearly alike" in found.notes
+
+
+def test_objects_of_bouts(study):
+    text = '{"v1": {"x": [[0, 1], [4, 6]], "y": [[1, 4]]}, "v2": {"y": [[2, 3]]}}'
+    due = [("v1", "x", 0, 1), ("v1", "y", 1, 4), ("v1", "x", 4, 6), ("v2", "y", 2, 3)]
+    assert rows(study(text, name="f.json")) == due
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "due"),
+    [
+        ("animal,corner,correct,start,end\na,3,1,1,5.5\nb,1,0,20,23\na,2,1,30,33\n", "f.csv", "must hold behaviours"),
+        ("2024-05-01 08:00:00,a,x\n2024-05-01 08:01:00,a,y\n2024-05-01 08:07:00,b,x\n", "f.csv", "must have a header"),
+        ("[2024-05-01 08:00:00] a x y\n[2024-05-01 08:01:00] a y\n[2024-05-01 08:07:00] b\n", "f.txt", "must hold"),
+        ('{"meta": {"v": ["x", "y"]}, "s": {"i": {"t": {"labels": [3, 3, 0]}}}}', "f.json", "another form"),
+    ],
+)
+def test_what_was_misread_is_refused(text, name, due, study):
+    with pytest.raises(ValueError, match=due):
+        study(text, name=name)
+
+
+def test_files_of_one_name_in_the_folders_of_an_archive_are_two(tmp_path):
+    with zipfile.ZipFile(tmp_path / "f.zip", "w") as archive:
+        for folder, label in (("drug", "x"), ("saline", "y")):
+            archive.writestr(f"{folder}/m1.csv", f"behaviour,start\n{label},0\nz,3\n")
+        archive.writestr(".DS_Store", b"\0\1")
+    assert list(map("".join, labels(read(tmp_path / "f.zip")))) == ["xz", "yz"]
