@@ -211,14 +211,24 @@ def collector_name(world: World) -> str:
 def random_scores(
     world: World, state: Tensor, length: int, num_plans: int, generator: torch.Generator, score_seed: int
 ) -> Tensor:
-    """The mean score `[B]`, float64, of random plans of legal actions from each of `state [B, ...]`."""
+    """The mean score `[B]`, float64, of random plans of legal actions from each of `state [B, ...]`.
+
+    Raises:
+        ValueError: it is infinite.
+    """
     uniform = UniformPrior(world.num_actions)
     if world.all_legal:  # nothing of the world is needed to draw them
         plans = uniform.sample(len(state) * num_plans, length, generator=generator)
         plans = plans.view(len(state), num_plans, length).to(state.device)
     else:
         plans, _ = sample_in_world(uniform, world, state, num_plans, length, generator=generator)
-    return true_scores(world, state, plans, score_seed).mean(1)
+    scores = true_scores(world, state, plans, score_seed).mean(1)
+    if not scores.isfinite().all():
+        raise ValueError(
+            f"world: its rewards must be finite, since scores are compared with the mean of random plans, got"
+            f" {float(scores[~scores.isfinite()][0])} in the mean; leave out what is forbidden by `legal_actions`"
+        )
+    return scores
 
 
 def true_scores(world: World, state: Tensor, plans: Tensor, seed: int) -> Tensor:

@@ -11,6 +11,7 @@ from torch import Tensor
 from neuroprior.testing.chi_square import alike
 from neuroprior.testing.rules import FALSE_ALARM, WORLD_CHECKS, check_by_kind, raises, require, same
 from neuroprior.worlds import SimulatorWorld, TabularWorld, World
+from neuroprior.worlds.world import check_objective, step_alive
 
 Simulator = Any
 """A world, of numbered actions or of vectors."""
@@ -50,6 +51,10 @@ def check_world(world: Any, num_states: int = 50, length: int = 6, seed: int = 0
     number = getattr(world, "num_actions", None)
     has_actions = isinstance(number, Integral) and int(number) > 0
     require(has_actions, f"`num_actions` must be an integer above 0, got {number!r}")
+    try:
+        check_objective(world.objective, world.discount)
+    except ValueError as error:
+        raise AssertionError(str(error)) from error
     generator = torch.Generator().manual_seed(seed)
     state = check_reset(world, num_states, seed)
     plans, wrong_plans = _plans(world, state, length, generator)
@@ -147,7 +152,7 @@ def _check_reached(
     """In the states that plans lead to: queries; terminated ones stay, and give nothing."""
     states = [state.repeat_interleave(plans.shape[1], 0)]
     for actions in plans.flatten(0, 1).unbind(1):
-        states.append(world.step(states[-1], actions, generator)[0])
+        states.append(_step_alive(world, states[-1], actions, generator)[0])
     reached = torch.cat(states)
     _check_queries(world, reached)
     check_queries(world, reached)
@@ -247,6 +252,17 @@ def check_batch(name: str, query: Callable[[Tensor], Tensor], state: Tensor, who
         require(alone, f"{name}: what is found in a state depends on its batch")
 
 
+def _step_alive(
+    world: Simulator, state: Tensor, action: Tensor, generator: torch.Generator | None = None
+) -> tuple[Tensor, Tensor]:
+    """A step as planners take it: where no action is legal the episode is over, whatever `step` returns there."""
+    return (
+        step_alive(world, state, action, generator)
+        if isinstance(world, World)
+        else world.step(state, action, generator)
+    )
+
+
 def _step_through(world: Simulator, state: Tensor, plans: Tensor, seed: int) -> tuple[Tensor, Tensor, bool]:
     """Final states `[B, P]` and rewards `[B, P, L]` of single steps, and whether their outcomes are random."""
     batch, num_plans, length = plans.shape[:3]
@@ -255,11 +271,11 @@ def _step_through(world: Simulator, state: Tensor, plans: Tensor, seed: int) -> 
     for p in range(num_plans):
         now, row = state, []
         for t in range(length):
-            after, reward = world.step(now, plans[:, p, t], torch.Generator().manual_seed(seed))
-            other = world.step(now, plans[:, p, t], torch.Generator().manual_seed(seed + 1))
+            after, reward = _step_alive(world, now, plans[:, p, t], torch.Generator().manual_seed(seed))
+            other = _step_alive(world, now, plans[:, p, t], torch.Generator().manual_seed(seed + 1))
             random = random or not (other[0].equal(after) and other[1].equal(reward))
             if not random:
-                half = world.step(now[batch // 2 :], plans[batch // 2 :, p, t])
+                half = _step_alive(world, now[batch // 2 :], plans[batch // 2 :, p, t])
                 alone = same(half[0], after[batch // 2 :]) and same(half[1], reward[batch // 2 :])
                 require(alone, "step: what happens in a state depends on its batch")
             now = after
@@ -279,7 +295,7 @@ def _check_distribution(world: Simulator, state: Tensor, plans: Tensor, seed: in
     require(same(rollout.final_state, again.final_state), "rollout: the same seed gave other states")
     rewards = []
     for t in range(plans.shape[1]):
-        now, reward = world.step(now, plans[:, t], generator)
+        now, reward = _step_alive(world, now, plans[:, t], generator)
         rewards.append(reward)
     final = _comparable(world, rollout.final_state[:, 0])
     observed = torch.cat([final, rollout.rewards[:, 0].double()], 1)

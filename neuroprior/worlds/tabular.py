@@ -38,7 +38,7 @@ class TabularWorld(World):
             1e-6. Outcomes of probability 0 are never drawn. None: the world is deterministic.
 
     Attributes:
-        next_state, reward: as given, `reward` always with a dimension for the maps.
+        next_state, reward: copies of what was given, `reward` always with a dimension for the maps.
         legal_table: `[S, A]` bool, or None where all actions are legal.
         outcomes: draws the outcomes; None for a deterministic world.
         compile_from: rollouts of at least so many steps go through a compiled loop, which gives the same: loading it is
@@ -76,8 +76,8 @@ class TabularWorld(World):
         check_range("next_state", next_state, self.num_states, "states")
         self.outcomes = None if probability is None else Outcomes(torch.as_tensor(probability), next_state.device)
         self.stochastic = self.outcomes is not None
-        self._set_maps(_reward_maps(torch.as_tensor(reward, device=next_state.device), next_state.shape))
-        self.next_state = next_state.long().contiguous()
+        self._set_maps(_reward_maps(torch.as_tensor(reward, device=next_state.device), next_state.shape).clone())
+        self.next_state = next_state.to(torch.long, copy=True).contiguous()
         self.legal_table = (
             None if legal_actions is None else _checked_legal(torch.as_tensor(legal_actions), self.next_state)
         )
@@ -313,7 +313,7 @@ def _checked_legal(legal: Tensor, next_state: Tensor) -> Tensor:
     stuck = (~legal.any(1)).nonzero()
     if len(stuck):
         raise ValueError(f"legal_actions[{int(stuck[0])}]: this state has no legal action; every state needs one")
-    return legal.to(next_state.device)
+    return legal.to(next_state.device, copy=True)
 
 
 def check_tabular(world: object) -> None:

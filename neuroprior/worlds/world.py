@@ -1,6 +1,7 @@
 """The interface of a world: a batched simulator in which a planner tries its plans."""
 
 from abc import ABC, abstractmethod
+from numbers import Integral
 from typing import Literal, NamedTuple, Self, TypeVar
 
 import torch
@@ -82,8 +83,15 @@ class World(ABC):
 
     def __init_subclass__(cls, **settings: object) -> None:
         super().__init_subclass__(**settings)
-        if "legal_actions" in vars(cls) and "all_legal" not in vars(cls):
+        definer = next(kind for kind in cls.__mro__ if {"legal_actions", "all_legal"} & vars(kind).keys())
+        if "all_legal" not in vars(definer):
             cls.all_legal = False
+        if isinstance(number := vars(cls).get("num_actions"), Integral):
+            cls.num_actions = int(number)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        # Gymnasium's spaces count in numpy's integers, which torch takes in few places.
+        super().__setattr__(name, int(value) if name == "num_actions" and isinstance(value, Integral) else value)
 
     def to(self, device: torch.device | str) -> Self:
         """Move the tensors of this world, and of worlds that it holds, to `device`; returns self."""
@@ -205,8 +213,15 @@ def join_states(states: list[Tensor], start: Tensor, shape: tuple[int, ...]) -> 
 def step_alive(
     world: World, state: Tensor, action: Tensor, generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
-    """As `world.step`, but a state `[N, ...]` in which no action is legal stays as it is, without reward."""
+    """As `world.step`, but a state `[N, ...]` in which no action is legal stays as it is, without reward.
+
+    Raises:
+        ValueError: the world changes the states that it is given, which planners plan from once more.
+    """
+    version = None if state.is_inference() else state._version
     after, reward = world.step(state, action, generator)
+    if version is not None and state._version != version:
+        raise ValueError(f"step: {type(world).__name__} must not change the states that it is given; change a clone")
     if world.all_legal:
         return after, reward
     alive = world.legal_actions(state).any(1)

@@ -376,3 +376,10 @@ def test_simulators_that_all_begin_alike_are_named(simulator):
 def test_simulators_that_begin_otherwise_are_held_out():
     comparison = compare(from_simulator(simulators.NoisyStart), ["markov"], ["sampling"], [4], **QUICK | {"seeds": 1})
     assert not any("All starts are the same state" in note for note in comparison.notes)
+
+
+def test_infinite_losses_are_refused():
+    ring = torch.stack([torch.arange(12).roll(-1), torch.arange(12).roll(1)], 1)
+    world = TabularWorld(ring, torch.arange(12.0).index_fill(0, torch.tensor([5]), -torch.inf))
+    with refuses("its rewards must be finite", "got -inf in the mean", "`legal_actions`"):
+        compare(world, ["uniform", "markov"], ["sampling"], [2, 16], **QUICK)

@@ -2,6 +2,7 @@
 
 import warnings
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -19,7 +20,8 @@ from neuroprior import (
     collect,
     oracle,
 )
-from neuroprior.planners import FrontierPlanner
+from neuroprior.planners import FrontierPlanner, execute
+from neuroprior.testing import check_world
 from neuroprior.worlds import Categories, Features, TabularWorld
 from tests.support.sources import seeded
 
@@ -150,3 +152,80 @@ def test_a_fit_says_what_it_cannot_use():
         MarkovPrior(4, 1, num_contexts=5).fit(known)
         MarkovPrior(4, 1).fit(known.without_context())
         CombinedPrior(4, num_contexts=5, effort="fast").fit(known, generator=seeded(2), max_steps=5, progress=False)
+
+
+class OnlyForward:
+    """Legal actions that a world takes from elsewhere than a `World`: none backwards."""
+
+    def legal_actions(self, state: Tensor) -> Tensor:
+        return torch.tensor([True, False, True, False]).expand(len(state), -1)
+
+
+class Forward(OnlyForward, Field):
+    pass
+
+
+class Free(Forward):
+    all_legal = True
+
+
+def test_legal_actions_of_another_base_count():
+    assert (Field().all_legal, Forward().all_legal, Free().all_legal) == (True, False, True)
+    state = torch.tensor([[3, 3]])
+    for make in (SamplingPlanner, FrontierPlanner, MCTSPlanner):
+        assert make(UniformPrior(4), 3, 64).plan(Forward(), state, seeded(0)).score.item() == -7 - 8 - 9
+        assert make(UniformPrior(4), 3, 64).plan(Field(), state, seeded(0)).score.item() == -5 - 4 - 3
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_the_number_of_actions_may_be_numpys(own):
+    if own:
+        world = Field()
+        world.num_actions = np.int64(4)
+    else:
+        world = type("Counted", (Field,), {"num_actions": np.int64(4)})()
+    assert type(world.num_actions) is int
+    for make in (SamplingPlanner, FrontierPlanner, MCTSPlanner):
+        assert make(UniformPrior(4), 2, 16).plan(world, torch.tensor([[3, 3]]), seeded(0)).score.item() == -5 - 4
+
+
+class InPlace(Field):
+    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        state[:, 0] += action
+        return state, state[:, 0].float()
+
+
+def test_a_step_that_changes_its_states_is_refused():
+    state = torch.tensor([[3, 3], [7, 1]])
+    for make in (SamplingPlanner, FrontierPlanner, MCTSPlanner):
+        with pytest.raises(ValueError, match=r"^step: InPlace must not change the states"):
+            make(UniformPrior(4), 3, 64).plan(InPlace(), state.clone(), seeded(0))
+    with pytest.raises(ValueError, match=r"^step: InPlace must not change the states"):
+        execute(SamplingPlanner(UniformPrior(4), 1, 4), InPlace(), state, num_steps=2)
+
+
+def test_a_table_keeps_copies():
+    table, reward, legal = torch.tensor([[0, 1], [1, 0]]), torch.tensor([0.0, 5.0]), torch.tensor([[True, True]] * 2)
+    world = TabularWorld(table, reward, legal)
+    table.fill_(7)
+    reward.fill_(9.0)
+    legal.fill_(False)
+    assert world.next_state.tolist() == [[0, 1], [1, 0]]
+    assert world.reward.tolist() == [[0, 5]]
+    assert world.legal_table is not None
+    assert bool(world.legal_table.all())
+
+
+class DeadEnd(Field):
+    """Beyond a sum of 50 nothing is legal; `step`, which is asked all the same, goes on."""
+
+    def legal_actions(self, state: Tensor) -> Tensor:
+        return (state.sum(1) < 50)[:, None].expand(-1, 4)
+
+
+def test_what_a_step_from_a_dead_end_returns_does_not_count():
+    check_world(DeadEnd())
+    world = DeadEnd()
+    world.objective = "sum"
+    with pytest.raises(AssertionError, match="`objective` must be"):
+        check_world(world)

@@ -4,8 +4,10 @@ import subprocess
 import sys
 
 import gymnasium
+import numpy as np
 import pytest
 import torch
+from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 
 from neuroprior import from_gymnasium
 from neuroprior.testing import check_world
@@ -88,10 +90,25 @@ def test_starts():
     assert int((with_passenger > 0).sum()) == 25 * 4 * 4
 
 
+class Drawn(gymnasium.Env):
+    """Steps are drawn from the table `P`."""
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.s = int(self.np_random.choice(len(self.P), p=self.initial_state_distrib))
+        return self.s, {}
+
+    def step(self, action):
+        outcomes = self.P[self.s][action]
+        number = self.np_random.choice(len(outcomes), p=[outcome[0] for outcome in outcomes])
+        _, self.s, reward, ended = outcomes[number]
+        return self.s, reward, ended, False, {}
+
+
 def test_an_end_that_is_also_passed_through_gets_a_state_of_its_own():
     """From 1 the episode may end in 2, or go on from there."""
 
-    class Both(Corridor):
+    class Both(Drawn):
         def __init__(self):
             self.action_space = gymnasium.spaces.Discrete(2)
             self.observation_space = gymnasium.spaces.Discrete(3)
@@ -112,6 +129,108 @@ def test_an_end_that_is_also_passed_through_gets_a_state_of_its_own():
     check_world(world)
 
 
+class Line(Drawn):
+    """Three states in a row; the last one ends the episode."""
+
+    action_space, observation_space = gymnasium.spaces.Discrete(2), gymnasium.spaces.Discrete(3)
+    initial_state_distrib = (1.0, 0.0, 0.0)
+
+    def __init__(self):
+        self.P = {s: {a: [(1.0, min(s + a, 2), float(s + a), s + a > 1)] for a in range(2)} for s in range(3)}
+
+
+class Masked(FrozenLakeEnv):
+    def action_masks(self):
+        return np.array([True, True, True, self.s > 3])
+
+
+class Moved(FrozenLakeEnv):
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.s = 14
+        return 14, {}
+
+
+class Generous(Line):
+    def step(self, action):
+        state, reward, *rest = super().step(action)
+        return state, reward + 10, *rest
+
+
+class Elsewhere(Line):
+    initial_state_distrib = (0.0, 1.0, 0.0)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.s = 0
+        return 0, {}
+
+
+def test_a_table_is_read_where_the_environment_does_what_it_says():
+    assert from_gymnasium(Line()).num_states == 3
+    lake = from_gymnasium(FrozenLakeEnv(is_slippery=False), progress=False)
+    masked = from_gymnasium(Masked(is_slippery=False), progress=False)
+    assert (lake.all_legal, masked.all_legal) == (True, False)
+    moved = from_gymnasium(Moved(is_slippery=False), progress=False)
+    assert moved.rollout(moved.reset(1), torch.tensor([[[2]]])).rewards.item() == 1  # from 14 to the right
+    generous = from_gymnasium(Generous(), progress=False)
+    assert generous.rollout(generous.reset(1), torch.tensor([[[1, 1]]])).rewards.tolist() == [[[11, 12]]]
+    patched = Line()
+    patched.step = Generous.step.__get__(patched)
+    for changed, words in (
+        (Masked(), "its `action_masks` is the user's"),
+        (Moved(), "its `reset` is the user's"),
+        (Generous(), "reward or end than its table says"),
+        (Elsewhere(), "it starts in state 0"),
+    ):
+        with refuses('method="table"', words):
+            from_gymnasium(changed, method="table")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({0: {0: [(0.5, 1, 0.0, False)], 1: [(1.0, 0, 0.0, False)]}}, "must sum to 1, got 0.5"),
+        ({0: {0: [(1.0, 1, 0.0, False)]}}, "another form (KeyError"),
+        ({0: {0: [(1.0, 1, 0.0)], 1: []}}, "another form (ValueError"),
+        ({0: {0: [(1.0, 7, 0.0, False)], 1: [(1.0, 0, 0.0, False)]}}, "another"),
+    ],
+)
+def test_tables_that_are_none(change, words):
+    env = Line()
+    env.P = env.P | change
+    env.step = lambda action: (0, 0.0, False, False, {})
+    with refuses('method="table"', words):
+        from_gymnasium(env, method="table")
+
+
+class RareNoise(gymnasium.Env):
+    """A line of 300 states, in one of which a coin sends to the beginning."""
+
+    action_space, observation_space = gymnasium.spaces.Discrete(2), gymnasium.spaces.Discrete(301)
+
+    def __init__(self, noisy):
+        self.noisy = noisy
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.s = 0
+        return 0, {}
+
+    def step(self, action):
+        if self.s == self.noisy and self.np_random.random() < 0.5:
+            self.s = 0
+        else:
+            self.s = min(self.s + int(action), 300)
+        return self.s, float(self.s == 300), self.s == 300, False, {}
+
+
+@pytest.mark.parametrize("noisy", [155, 157, 203])
+def test_noise_in_one_state_far_away_is_found(noisy):
+    with refuses("led to two different states", 'method="step"'):
+        from_gymnasium(RareNoise(noisy), method="enumerate", progress=False)
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [
@@ -121,7 +240,7 @@ def test_an_end_that_is_also_passed_through_gets_a_state_of_its_own():
         (lambda: from_gymnasium(3), ["a function that makes one, got int"]),
         (lambda: from_gymnasium(Corridor(), colour="red"), ["colour: options make an environment from its name"]),
         (lambda: from_gymnasium(Corridor(), method="table"), ['method="table"', "attribute P"]),
-        (lambda: from_gymnasium("Taxi-v4", fickle_passenger=True), ["fickle_passenger"]),
+        (lambda: from_gymnasium("Taxi-v4", method="table", fickle_passenger=True), ["fickle_passenger"]),
         (lambda: from_gymnasium("Taxi-v4", method="guess"), ["`method` must", "'guess'"]),
         (lambda: from_gymnasium("Taxi-v4", starts="all"), ["`starts` must", "'all'"]),
         (lambda: from_gymnasium("Taxi-v4", seeds=[1, 2]), ["seeds: a table read from P has one layout"]),

@@ -1,5 +1,6 @@
 """Gymnasium environments as tables: read from their attribute `P`, or enumerated breadth first by copies."""
 
+import copy
 import hashlib
 import warnings
 from collections.abc import Callable, Iterator
@@ -17,12 +18,18 @@ from neuroprior.worlds.gymnasium.environment import action_names, without_limits
 from neuroprior.worlds.simulators.copies import ReplayCopier
 from neuroprior.worlds.simulators.driver import TRUNCATED, View
 from neuroprior.worlds.simulators.fingerprints import digest
-from neuroprior.worlds.simulators.generators import keep_global_generators, seed_generators
+from neuroprior.worlds.simulators.generators import keep_global_generators, seed_generators, state_of_generators
 from neuroprior.worlds.simulators.trials import Start
 from neuroprior.worlds.simulators.world import SimulatorWorld
 
 CHECKED_FIRST, CHECKED_EVERY = 100, 10
 """Transitions are repeated, as a check, from so many states at first, and from every so many after them."""
+
+REPEATS_OF_NOISE = 8
+"""How often a transition is repeated that draws random numbers."""
+
+MASK_METHODS = ("action_masks", "action_mask")
+"""Methods of an environment that say which actions are legal."""
 
 
 def has_table(env: Any) -> bool:
@@ -31,19 +38,50 @@ def has_table(env: Any) -> bool:
     return isinstance(getattr(base, "P", None), dict) and hasattr(base, "initial_state_distrib") and env is base
 
 
-def overrides_step(env: Any) -> bool:
-    """Whether a class of the user's steps otherwise than the toy text of Gymnasium that it inherits a table from."""
+def find_change(env: Any) -> str | None:
+    """What an environment does otherwise than its table says: a method of the user's, or a step of a random walk.
+
+    A user may change a toy text of Gymnasium, whose table stays, or give one of his own that does not say all.
+    """
     kinds = type(env).__mro__
-    definer = next(kind for kind in kinds if "step" in vars(kind))
     inherits = any(kind.__module__.startswith("gymnasium.envs") for kind in kinds)
-    return inherits and not definer.__module__.startswith("gymnasium.")
+    for name in ("step", "reset", *MASK_METHODS):
+        definer = next((kind for kind in kinds if name in vars(kind)), None)
+        by_user = name in vars(env) or (definer is not None and not definer.__module__.startswith("gymnasium."))
+        if by_user and (inherits or name in MASK_METHODS):
+            return f"its `{name}` is the user's, of which its table knows nothing"
+    walker = copy.deepcopy(env)
+    draw = np.random.default_rng(0)
+    for walk in range(NUM_WALKS):
+        walker.reset(seed=walk)
+        if not walker.initial_state_distrib[int(walker.s)] > 0:
+            return f"it starts in state {walker.s}, which its table says it does not"
+        for _ in range(WALK_LENGTH):
+            state, action = int(walker.s), int(draw.integers(walker.action_space.n))
+            _, reward, ended, truncated, _ = walker.step(action)
+            told = [(int(to), float(gain), bool(end)) for p, to, gain, end in walker.P[state][action] if p > 0]
+            if (int(walker.s), float(reward), bool(ended)) not in told:
+                return f"action {action} in state {state} led to another state, reward or end than its table says"
+            if ended or truncated:
+                break
+    return None
+
+
+def find_table(env: Any) -> EpisodicWorld | None:
+    """The table of an environment, where it has one that says what it does; None else."""
+    if not has_table(env):
+        return None
+    try:
+        return read_table(env)
+    except ValueError:
+        return None
 
 
 def read_table(env: Any) -> EpisodicWorld:
     """The table of a toy text; see `from_gymnasium`.
 
     Raises:
-        ValueError: it has no table, or an incomplete one.
+        ValueError: it has no table, an incomplete one, or one of another environment.
     """
     if not has_table(env):
         raise ValueError(
@@ -53,7 +91,23 @@ def read_table(env: Any) -> EpisodicWorld:
     base = env.unwrapped
     if getattr(base, "fickle_passenger", False):
         raise ValueError("fickle_passenger: the passenger's changes of mind are not in the environment's table P")
-    next_state, reward, probability, ends = _outcomes(base.P, int(env.action_space.n))
+    try:
+        next_state, reward, probability, ends = _outcomes(base.P, int(env.action_space.n))
+        sums = probability.sum(-1)
+        wrong = ((sums - 1).abs() > 1e-6).nonzero().tolist()
+        change = None if wrong else find_change(env)
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise ValueError(
+            'method="table": P must give (probability, next state, reward, ended) for each state and action, got'
+            f' another form ({type(error).__name__}: {error}); "enumerate" and "step" do without'
+        ) from error
+    if wrong:
+        state, action = wrong[0]
+        raise ValueError(
+            f'method="table": the probabilities of P[{state}][{action}] must sum to 1, got {float(sums[state, action])}'
+        )
+    if change:
+        raise ValueError(f'method="table": {change}; "enumerate" and "step" take the environment as it is')
     next_state, ended = _make_absorbing(next_state, probability, ends)
     states = len(ends)
     extra = len(ended) - states
@@ -183,10 +237,11 @@ class _Search:
             row, rewards = [state] * self.driver.num_actions, [0.0] * self.driver.num_actions
             saved = self._waiting.pop(state, None)
             for action in [] if self.ended[state] else np.flatnonzero(self.masks[state]).tolist():
-                seed = state * self.driver.num_actions + action
-                row[action], rewards[action] = self._try(layout, saved, action, 2 * seed)
-                if state < CHECKED_FIRST or state % CHECKED_EVERY == 0:
-                    again = self._try(layout, saved, action, 2 * seed + 1)
+                seed = (REPEATS_OF_NOISE + 1) * (state * self.driver.num_actions + action)
+                row[action], rewards[action], draws = self._try(layout, saved, action, seed)
+                is_checked = state < CHECKED_FIRST or state % CHECKED_EVERY == 0
+                for repeat in range(REPEATS_OF_NOISE if draws else int(is_checked)):
+                    again = self._try(layout, saved, action, seed + 1 + repeat)[:2]
                     if again != (row[action], rewards[action]):
                         raise ValueError(
                             f"env: action {action} led to two different states from the same one;"
@@ -196,13 +251,16 @@ class _Search:
             self.rewards.append(rewards)
             show(len(self.next_state), len(self.layouts))
 
-    def _try(self, layout: int, saved: Any, action: int, seed: int) -> tuple[int, float]:
-        """Where an action leads from a saved state under the random numbers of a seed, and its reward."""
+    def _try(self, layout: int, saved: Any, action: int, seed: int) -> tuple[int, float, bool]:
+        """Where an action leads from a saved state under the random numbers of a seed, its reward, whether it draws."""
         simulator = self.copier.load(saved)
-        seed_generators(self.copier.generators(simulator), seed)
+        generators = list(self.copier.generators(simulator))
+        seed_generators(generators, seed)
+        before = state_of_generators(generators)
         observation, reward, ended, info = self.driver.take(simulator, action)
+        draws = before != state_of_generators(generators)
         view = self.driver.view(simulator, observation, info)
-        return self._number(layout, simulator, view, bool(ended or self.driver.end(view))), reward
+        return self._number(layout, simulator, view, bool(ended or self.driver.end(view))), reward, draws
 
     def _number(self, layout: int, simulator: Any, view: View, ended: bool) -> int:
         """The number of the state in which a simulator is; a new one is saved."""

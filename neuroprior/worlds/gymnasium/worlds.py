@@ -14,7 +14,7 @@ from neuroprior.worlds.gymnasium.environment import (
     open_environment,
     without_limits,
 )
-from neuroprior.worlds.gymnasium.tables import enumerate_states, has_table, overrides_step, read_table
+from neuroprior.worlds.gymnasium.tables import enumerate_states, find_table, read_table
 from neuroprior.worlds.observations import Features
 from neuroprior.worlds.simulators.building import from_simulator
 from neuroprior.worlds.simulators.driver import FromStep
@@ -57,10 +57,11 @@ def from_gymnasium(
     "enumerate" has as many starts as `seeds`, so that with one seed every episode begins in the same state; where other
     seeds start otherwise, that is a warning.
 
-    "auto" takes a table where there is one. It steps where observations are real numbers or the environment is
-    stochastic, and enumerates otherwise.
+    "auto" takes a table where there is one, and the environment does on random walks what it says. It steps where
+    observations are real numbers or the environment is stochastic, and enumerates otherwise.
 
-    Legal actions are those of a method `action_masks()` or `action_mask()`, or of `info["action_mask"]`.
+    Legal actions are those of a method `action_masks()` or `action_mask()`, or of `info["action_mask"]`. In tables all
+    are legal: the masks of Taxi's `info` leave out what changes nothing, which its table has with its rewards.
 
     An episode that has ended stays in its last state, without rewards. Time limits that are wrappers (`TimeLimit`) are
     removed: plans have a length of their own.
@@ -101,16 +102,14 @@ def from_gymnasium(
     if starts not in ("initial", "any"):
         raise ValueError(f'`starts` must be "initial" or "any", got {starts!r}')
     check_sizes(max_states=max_states)
-    chosen = [seed] if seeds is None else list(seeds)
+    chosen = [seed] if seeds is None else list(seeds) if isinstance(seeds, Iterable) else []
     if not chosen or any(not isinstance(one, int | np.integer) or one < 0 for one in chosen):
-        raise ValueError(f"`seeds` must be one or more integers that are not negative, got {chosen}")
+        raise ValueError(f"`seeds` must be one or more integers that are not negative, got {chosen or seeds}")
     opened, make = open_environment(env, make_options)
-    if method == "auto" and has_table(opened) and not overrides_step(opened):
-        method = "table"
-    if method == "table" and seeds is not None:
+    table = read_table(opened) if method == "table" else find_table(opened) if method == "auto" else None
+    if table is not None and seeds is not None:
         raise ValueError('seeds: a table read from P has one layout; use method="enumerate"')
-    if method == "table":
-        table = read_table(opened)
+    if table is not None:
         return table.start_anywhere() if starts == "any" else table
     flatten = Flattener(opened.observation_space)
     how: dict[str, Any] = {
