@@ -606,3 +606,15 @@ def test_files_of_one_name_in_the_folders_of_an_archive_are_two(tmp_path):
             archive.writestr(f"{folder}/m1.csv", f"behaviour,start\n{label},0\nz,3\n")
         archive.writestr(".DS_Store", b"\0\1")
     assert list(map("".join, labels(read(tmp_path / "f.zip")))) == ["xz", "yz"]
+
+
+def test_an_event_log_has_starts_completions_and_completions_alone(study):
+    header = "case:concept:name,concept:name,time:timestamp,lifecycle:transition\n"
+    lines = [("a", "x", 0, "start"), ("a", "x", 4, "complete"), ("a", "y", 5, "complete"), ("a", "z", 6, "schedule")]
+    lines += [("b", "y", 1, "complete"), ("b", "x", 2, "start"), ("b", "x", 9, "complete")]
+    found = study(header + "".join(f"{case},{what},2024-05-01 08:00:0{at},{kind}\n" for case, what, at, kind in lines))
+    begin = found.events["start"].min()
+    bouts = [(case, what, start - begin, stop - begin) for case, what, start, stop in rows(found)]
+    assert bouts == [("a", "x", 0, 4), ("a", "y", 5, 5), ("b", "y", 1, 1), ("b", "x", 2, 9)]
+    assert any("2 completions have no start" in note for note in found.notes)
+    assert any("1 rows are neither starts nor completions (schedule)" in note for note in found.notes)
