@@ -30,7 +30,11 @@ def rows_of_events(table: Table) -> Part:
     start, stop = _fill_by_durations(table, start, stop, duration_times)
     wrong = np.flatnonzero(stop < start - 1e-9)
     if wrong.size:
-        what = f"the stop {stop[wrong[0]]:g} is before the start {start[wrong[0]]:g}"
+        texts = [
+            table.joined(table.roles.at[use])[wrong[0]] if use in table.roles.at else f"{values[wrong[0]]:g}"
+            for use, values in (("stop", stop), ("start", start))
+        ]
+        what = f"the stop {texts[0]} is before the start {texts[1]}"
         table.problems.add(f"`stop` must not be before `start`; {what}", wrong.tolist(), table.place)
     if start_times is not None:
         empty = table.joined(table.roles.at["start"]) == ""

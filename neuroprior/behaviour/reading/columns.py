@@ -42,6 +42,9 @@ MAX_CODES = 20
 MAX_OBSERVERS = 10
 """Different observers at most, where no user named their column."""
 
+KIND_OF_ROW = "last word of the label"
+"""A column of starts and stops that stood in one with the behaviours."""
+
 MIN_WIDE = 3
 """Columns at least, where each row is a sequence."""
 
@@ -668,6 +671,7 @@ def _check_is_no_summary(sheet: Sheet, roles: Roles) -> None:
 
 def _choose_layout(sheet: Sheet, roles: Roles, words: Mapping[str, str]) -> None:
     """Choose between events and rows of starts and stops, and leave out inferred uses that the layout has not."""
+    _split_event_words(sheet, roles, words)
     if roles.layout in ("rows of sequences", "columns of behaviours", "columns of subjects"):
         if "event_type" in roles.inferred:
             roles.at.pop("event_type", None)
@@ -681,6 +685,20 @@ def _choose_layout(sheet: Sheet, roles: Roles, words: Mapping[str, str]) -> None
             roles.layout = "rows of starts and stops"
             if "stop" in roles.inferred:
                 del roles.at["stop"]
+
+
+def _split_event_words(sheet: Sheet, roles: Roles, words: Mapping[str, str]) -> None:
+    """Part labels such as "groom start" and "groom stop" into the behaviour and the kind of row, if all are such."""
+    taken = {"stop", "duration", "event_type"} & roles.at.keys()
+    if roles.layout != "events" or taken or "start" not in roles.at or len(roles.at["behaviour"]) > 1:
+        return
+    name = roles.at["behaviour"][0]
+    parts = sheet.frame[name].str.extract(r"^(.*\w)[\s_:.\-]+(\w+)$")
+    if parts.isna().any(axis=None) or _event_words(parts[1], words) != {"start", "stop"}:
+        return
+    sheet.frame[name], sheet.frame[KIND_OF_ROW] = parts[0], parts[1]
+    roles.infer("event_type", [KIND_OF_ROW])
+    roles.notes.append(f"the last words of {name!r} say which rows are starts and which stops")
 
 
 def _check_direction(sheet: Sheet, roles: Roles) -> None:

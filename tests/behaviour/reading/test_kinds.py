@@ -618,3 +618,25 @@ def test_an_event_log_has_starts_completions_and_completions_alone(study):
     assert bouts == [("a", "x", 0, 4), ("a", "y", 5, 5), ("b", "y", 1, 1), ("b", "x", 2, 9)]
     assert any("2 completions have no start" in note for note in found.notes)
     assert any("1 rows are neither starts nor completions (schedule)" in note for note in found.notes)
+
+
+def test_labels_that_end_in_start_and_stop(study):
+    lines = [
+        ("a", 0, "rest start"),
+        ("a", 1, "walk_ON"),
+        ("a", 3, "rest stop"),
+        ("a", 4, "walk_off"),
+        ("b", 2, "rest start"),
+    ]
+    lines += [("b", 9, "rest stop")]
+    found = study("animal,time,event\n" + "".join(f"{animal},{at},{what}\n" for animal, at, what in lines))
+    assert rows(found) == [("a", "rest", 0, 3), ("a", "walk", 1, 4), ("b", "rest", 2, 9)]
+    one = study("animal,time,event\na,0,lights on\na,2,rest\na,5,lights off\n")
+    assert labels(one) == [["lights on", "rest", "lights off"]]
+
+
+def test_a_stop_before_its_start_is_shown_as_it_is_written(study):
+    with pytest.raises(ValueError, match="the stop 2024-10-27 02:05 is before the start 2024-10-27 02:55"):
+        study(
+            "animal,behaviour,start,stop\na,x,2024-10-27 02:55,2024-10-27 02:05\na,y,2024-10-27 03:00,2024-10-27 03:10"
+        )
