@@ -159,3 +159,10 @@ def test_a_shape_may_be_a_list() -> None:
 def test_no_boards_are_a_batch() -> None:
     world = sliding_tiles(shape=(2, 2))
     assert len(world.observe(world.reset(0))) == len(world.lower_bound(world.reset(0))) == 0
+
+
+def test_each_tile_in_each_cell_and_the_blank_have_keys_of_their_own() -> None:
+    """Compiled code reads them without a check of the bounds."""
+    keys = sliding_tiles(shape=(2, 3)).rules.keys
+    assert keys.shape == (2 * 3 + 1, 2 * 3)
+    assert len(set(keys.ravel().tolist())) == keys.size
