@@ -166,3 +166,11 @@ def test_each_tile_in_each_cell_and_the_blank_have_keys_of_their_own() -> None:
     keys = sliding_tiles(shape=(2, 3)).rules.keys
     assert keys.shape == (2 * 3 + 1, 2 * 3)
     assert len(set(keys.ravel().tolist())) == keys.size
+
+
+def test_states_that_are_no_boards_are_refused() -> None:
+    world = sliding_tiles(shape=(2, 3))
+    state = world.reset(3, torch.Generator().manual_seed(0))
+    state[1, 0, :2] = 4
+    with pytest.raises(ValueError, match=r"`state\[1\]` must hold each of 0 to 5 once"):
+        world.rollout(state, torch.zeros(3, 1, 2, dtype=torch.long))
