@@ -9,10 +9,12 @@ import numpy as np
 import pandas as pd
 
 from neuroprior.behaviour.reading.names import (
+    ACTORS,
     ANIMALS,
     DEEPETHOGRAM,
     HOUSINGS,
     NAMES,
+    OF_NO_SUBJECT,
     PERIODS,
     PROGRAMS,
     SIMBA,
@@ -25,7 +27,7 @@ from neuroprior.behaviour.reading.names import (
 )
 from neuroprior.behaviour.reading.problems import Problems, ReadingError
 from neuroprior.behaviour.reading.sheets import Sheet
-from neuroprior.behaviour.reading.times import MISSING_TIMES, YEAR_FIRST, count_times, read_times
+from neuroprior.behaviour.reading.times import MISSING_TIMES, SECONDS, YEAR_FIRST, count_times, read_times, unit_of_name
 
 NOT_USED = "none"
 """Stands for a column's name: no column has this use."""
@@ -33,7 +35,7 @@ NOT_USED = "none"
 INDICATORS = frozenset(("0", "1", "", "-1", "true", "false", "0.0", "1.0", "-1.0"))
 MONTH = re.compile(r"(jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec)[a-z]*[._\- ]?(\d{2}|\d{4})", re.IGNORECASE)
 DATE_INSIDE = r"\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}:\d{2}:\d{2}"
-NO_BEHAVIOURS = re.compile(r"(low[_ ]prob|in zone|result|probability|arena|zone)", re.IGNORECASE)
+NO_BEHAVIOURS = re.compile(r"(low[_ ]prob|in zone|result|probability|arena|zone|place|site|location)", re.IGNORECASE)
 """Columns of zeros and ones that programs write beside those of behaviours."""
 
 MAX_CODES = 20
@@ -276,16 +278,26 @@ def _drop_empty(sheet: Sheet, roles: Roles) -> None:
 
 
 def _fill_down(sheet: Sheet, roles: Roles) -> None:
-    """Let what stands in the first row of a subject, recording or level alone, as in merged cells, go on below it."""
-    for name in dict.fromkeys(name for use in ("recording", "subject", "factors") for name in roles.at.get(use, [])):
-        column = sheet.frame[name]
-        given = column[column != ""]
-        empty = len(column) - len(given)
-        is_repeated = (given.shift() == given).any()  # cells that are written in each row may be forgotten in some
-        if not len(given) or column.iloc[0] == "" or is_repeated or empty < len(column) / 3:
-            continue
-        sheet.frame[name] = column.where(column != "").ffill()
-        roles.notes.append(f"the column {name!r} is filled where its values begin, and each is read to go on below it")
+    """Let what stands in the first row of a subject, recording or level alone, as in merged cells, go on below it.
+
+    Levels go on within a subject and a recording alone, where their cells are filled.
+    """
+    frame, behaviour = sheet.frame, roles.at["behaviour"][0]
+    whole: list[str] = []
+    for use in ("subject", "recording", "factors"):
+        for name in roles.at.get(use, []):
+            column = frame[name]
+            given = column != ""
+            is_repeated = (column[given].shift() == column[given]).any()  # may be forgotten in some rows
+            as_others = frame[behaviour][~given].isin(frame[behaviour][given]).mean() >= 0.5  # not of nobody
+            if not given.all() and column.iloc[0] != "" and not is_repeated and given.mean() < 2 / 3 and as_others:
+                groups = [frame[one] for one in whole] or np.zeros(len(frame))
+                frame[name] = column.where(given).groupby(groups).ffill().fillna("")
+                roles.notes.append(
+                    f"the column {name!r} is filled where its values begin, and each is read to go on below it"
+                )
+            if use != "factors" and frame[name].ne("").all():
+                whole.append(name)
 
 
 def _drop_index(sheet: Sheet, roles: Roles) -> None:
@@ -343,8 +355,12 @@ def _find_use(sheet: Sheet, roles: Roles, use: str, words: Mapping[str, str]) ->
         kept = kept or [name for name in candidates if sorted(sheet.frame[name].unique()) == ["0", "1"]]
     elif use in ("start", "stop", "duration"):
         kept = []
+        _check_is_in_one_column(sheet, candidates)
         for name in candidates:
             times, digits, filled = count_times(sheet.frame[name].to_numpy(object))
+            bounds = name.lower().endswith("min") and f"{name[:-3]}max" in map(str.lower, sheet.frame)
+            if use == "duration" and (bounds or _is_length_of_all(sheet, roles, name)):
+                continue
             if filled and (times * 2 > filled or digits * 2 > filled or (times and name == candidates[0])):
                 kept.append(name)  # what cannot be read in it is an error
             elif filled and name == candidates[0]:
@@ -363,12 +379,27 @@ def _find_use(sheet: Sheet, roles: Roles, use: str, words: Mapping[str, str]) ->
             roles.notes.append(f"the column {candidates[0]!r} is empty, and not used as {use}")
         elif use == "subject" and not kept:
             free = [name for name in sheet.frame if name not in roles.used() and sheet.frame[name].duplicated().any()]
-            ids = [name for name in free if plain(name).endswith(" id")]
-            fallback = (*ANIMALS, *(HOUSINGS if "recording" not in roles.at else ()))
-            named = [name for name in free if plain(name) in fallback and not _is_indicator(sheet.frame[name])]
-            kept = ids if len(ids) == 1 else named
+            others = (*NAMES["behaviour"], *OF_NO_SUBJECT)
+            ids = [name for name in free if plain(name).endswith(" id") and plain(name)[:-3] not in others]
+            fallback = (*ANIMALS, *ACTORS, *(HOUSINGS if "recording" not in roles.at else ()))
+            apart = [name for name in free if plain(name) in fallback and _are_numbered_anew(sheet, roles, [], name)]
+            kept = ids if len(ids) == 1 else apart
     if kept:
         roles.infer(use, kept if use in ("factors", "context", "recording") else kept[:1])
+
+
+def _check_is_in_one_column(sheet: Sheet, candidates: list[str]) -> None:
+    """Refuse hours, minutes and seconds that each have a column of their own.
+
+    Raises:
+        ReadingError: columns of one name differ in their unit, and the smaller units stay below 60.
+    """
+    parts = [name for name in sheet.frame if candidates and plain(name) == plain(candidates[0])]
+    units = {unit_of_name(name): pd.to_numeric(sheet.frame[name], errors="coerce").max() for name in parts}
+    if len(units.keys() & {"h", "min", "s"}) > 1 and all(units[unit] < 60 for unit in units.keys() & {"min", "s"}):
+        raise ReadingError(
+            f"{sheet.name}: a time must stand in one column, got {', '.join(parts)}; join them, such as 9:05:30"
+        )
 
 
 def _choose_recordings(sheet: Sheet, roles: Roles) -> None:
@@ -385,8 +416,9 @@ def _choose_recordings(sheet: Sheet, roles: Roles) -> None:
     for name in [*_periods(sheet, roles, candidates), *candidates]:
         groups = sheet.frame.groupby([*chosen, name], sort=False).ngroups
         before = sheet.frame.groupby(chosen, sort=False).ngroups if chosen else 0
-        if may_count and not sheet.frame.duplicated([*subjects, *(chosen if recur else []), name]).any():
-            where = "of a recording, " if chosen else "of a subject, " if subjects else ""
+        within = chosen if recur and _rise(sheet, roles, [*subjects, *chosen]) else []
+        if may_count and not sheet.frame.duplicated([*subjects, *within, name]).any():
+            where = "of a recording, " if within else "of a subject, " if subjects else ""
             roles.notes.append(f"the column {name!r} differs in each row {where}and is not used as recording")
         elif groups > before:
             chosen.append(name)
@@ -395,25 +427,60 @@ def _choose_recordings(sheet: Sheet, roles: Roles) -> None:
 
 
 def _periods(sheet: Sheet, roles: Roles, recordings: list[str]) -> list[str]:
-    """Return the columns of days, weeks or blocks that divide recordings: whose times lie upon one another, if any."""
+    """Return the columns of days or weeks in which sessions are numbered anew, and of blocks in which trials are."""
     others = [name for use, names in roles.at.items() if use != "factors" for name in names]
-    known = PERIODS if all(plain(name).startswith("trial") for name in recordings) else PERIODS[:-1]  # blocks of trials
+    subjects = roles.at.get("subject", [])
+    trials = recordings and all(plain(name).startswith("trial") for name in recordings)
+    again = bool(trials) and bool(sheet.frame.duplicated([*subjects, *recordings]).any())
+    known = PERIODS if again else PERIODS[:-1]
     periods = [name for name in sheet.frame if plain(name) in known and name not in [*others, *recordings]]
-    keys = [*roles.at.get("subject", []), *recordings]
+    keys = [*subjects, *([] if trials else recordings)]
+    return [name for name in periods if _are_numbered_anew(sheet, roles, keys, name)]
+
+
+def _are_numbered_anew(sheet: Sheet, roles: Roles, keys: list[str], name: str) -> bool:
+    """Return whether the rows of each value of a column stand together within `keys`, and its times begin anew.
+
+    Without times, whether most values have several rows.
+    """
+    frame = sheet.frame
+    number = frame.groupby([*keys, name], sort=False).ngroup().to_numpy()
+    key = frame.groupby(keys, sort=False).ngroup().to_numpy() if keys else np.zeros(len(frame), np.int64)
+    order = np.argsort(key, kind="stable")
+    number, key = number[order], key[order]
+    begins = np.flatnonzero(np.diff(number, prepend=-1) != 0)
+    if len(begins) != len(np.unique(number)) or frame[name].eq("").any() or frame[name].nunique() < 2:
+        return False
     if "start" not in roles.at:
-        return [name for name in periods if 1 < sheet.frame[name].nunique() < len(sheet.frame)]
+        return float(np.median(np.diff(np.append(begins, len(number))))) >= 2
+    times = _times(sheet, roles)[order]
+    changes = begins[1:][key[begins[1:]] == key[begins[1:] - 1]]
+    return len(changes) > 0 and float((times[changes] < times[changes - 1]).mean()) > 0.9
+
+
+def _times(sheet: Sheet, roles: Roles) -> Any:
+    """Return the times of the starts, float64 `[rows]`, whatever is wrong with them."""
     texts = sheet.frame[roles.at["start"][-1]].to_numpy(object)
-    times = read_times(texts, "start", sheet.place, Problems(), separator=sheet.separator).values
-    return [name for name in periods if recordings and _lie_upon_one_another(sheet.frame, keys, name, times)]
+    return read_times(texts, "start", sheet.place, Problems(), separator=sheet.separator).values
 
 
-def _lie_upon_one_another(frame: Any, keys: list[str], name: str, times: Any) -> bool:
-    """Return whether the times of the values of a column overlap within `keys`, as those of days numbered anew do."""
-    spans = frame.assign(**{"\1": times}).groupby([*keys, name], sort=False)["\1"].agg(["min", "max"]).dropna()
-    spans = spans.reset_index().assign(key=lambda rows: rows.groupby(keys, sort=False).ngroup())
-    spans = spans.sort_values(["key", "min"], kind="stable")
-    before = spans.groupby("key")["max"].cummax().groupby(spans["key"]).shift()
-    return bool((spans["min"] < before).any())
+def _rise(sheet: Sheet, roles: Roles, keys: list[str]) -> bool:
+    """Return whether times, if there are any, rise from row to row within `keys`."""
+    if "start" not in roles.at or not keys:
+        return True
+    times = pd.Series(_times(sheet, roles))
+    steps = times.groupby(sheet.frame.groupby(keys, sort=False).ngroup().to_numpy()).diff()
+    return bool((steps.dropna() >= 0).mean() > 0.95) if steps.notna().any() else True
+
+
+def _is_length_of_all(sheet: Sheet, roles: Roles, name: str) -> bool:
+    """Return whether a duration is the same in all rows, and longer than the time between most of them."""
+    if "start" not in roles.at or sheet.frame[name].nunique() > 1 or len(sheet.frame) < 3:
+        return False
+    length = read_times(sheet.frame[name].to_numpy(object), "duration", sheet.place, Problems()).values[0]
+    factor = SECONDS.get(unit_of_name(name), 1.0) / SECONDS.get(unit_of_name(roles.at["start"][-1]), 1.0)
+    steps = np.diff(np.sort(_times(sheet, roles)))
+    return bool(np.median(steps) < 0.5 * length * factor)
 
 
 def _add_dates(sheet: Sheet, roles: Roles) -> None:
@@ -493,7 +560,7 @@ def _choose_behaviour(sheet: Sheet, roles: Roles, is_range: bool, closed: set[st
     elif (
         (indicators := _indicator_columns(frame, free))
         and not (len(indicators) == 1 and _only_label(frame, free))
-        and ("stop" not in roles.at or _are_bins(sheet, roles))  # else flags of visits
+        and ("stop" not in roles.at or _are_bins(sheet, roles) or _are_exclusive(frame, indicators))  # else flags
     ):
         roles.at["behaviour"], roles.layout = indicators, "columns of behaviours"
         if any(name.startswith("Probability_") for name in free):
@@ -502,7 +569,7 @@ def _choose_behaviour(sheet: Sheet, roles: Roles, is_range: bool, closed: set[st
             roles.program = DEEPETHOGRAM
     elif run := _labelled_run(frame, free, 2 if "start" in roles.at else MIN_WIDE):
         roles.at["behaviour"], roles.layout = run, "rows of sequences"
-    elif label := _only_string(frame, free) or (roles.at and _only_label(frame, free)):
+    elif label := ("start" not in roles.at and _only_string(frame, free)) or (roles.at and _only_label(frame, free)):
         roles.at["behaviour"] = [label]
     else:
         uses = "; ".join(f"{use} is {', '.join(names)}" for use, names in roles.at.items())
@@ -616,13 +683,22 @@ def _labelled_run(frame: Any, free: list[str], min_columns: int) -> list[str]:
         best = run if len(run) > len(best) else best
     if len(best) < min_columns:
         return []
-    # A neighbour that shows few of their labels is one of them.
+    if min_columns >= MIN_WIDE:
+        return best
+    # Beside a time a neighbour that shows few of their labels is one of them.
+    labels = {name: one if not NO_BEHAVIOURS.match(name) else set() for name, one in labels.items()}
     common, first, last = set().union(*(labels[name] for name in best)), free.index(best[0]), free.index(best[-1])
     while first > 0 and len(labels[free[first - 1]] & common) >= 0.5 * max(len(labels[free[first - 1]]), 1):
         first -= 1
     while last + 1 < len(free) and len(labels[free[last + 1]] & common) >= 0.5 * max(len(labels[free[last + 1]]), 1):
         last += 1
     return free[first : last + 1]
+
+
+def _are_exclusive(frame: Any, indicators: list[str]) -> bool:
+    """Return whether one of several columns of zeros and ones is one in nearly each row."""
+    ones = sum(_is_one(frame[name]).astype(int) for name in indicators)
+    return len(indicators) > 1 and float((ones == 1).mean()) > 0.95
 
 
 def _only_string(frame: Any, free: list[str]) -> str | None:
@@ -696,6 +772,10 @@ def _split_event_words(sheet: Sheet, roles: Roles, words: Mapping[str, str]) -> 
     parts = sheet.frame[name].str.extract(r"^(.*\w)[\s_:.\-]+(\w+)$")
     if parts.isna().any(axis=None) or _event_words(parts[1], words) != {"start", "stop"}:
         return
+    keys = [sheet.frame[one] for use in ("recording", "subject") for one in roles.at.get(use, [])]
+    kinds = parts[1].str.lower().groupby([*keys, parts[0]], sort=False)
+    if (kinds.shift() == parts[1].str.lower()).mean() > 0.05 or (kinds.transform("size") < 2).mean() > 0.05:
+        return  # they do not take turns
     sheet.frame[name], sheet.frame[KIND_OF_ROW] = parts[0], parts[1]
     roles.infer("event_type", [KIND_OF_ROW])
     roles.notes.append(f"the last words of {name!r} say which rows are starts and which stops")
@@ -747,8 +827,7 @@ def _has_equal_steps(sheet: Sheet, roles: Roles) -> bool:
     """Return whether there are times that grow by equal steps from row to row of each recording."""
     if "start" not in roles.at:
         return False
-    texts = sheet.frame[roles.at["start"][-1]].to_numpy(object)
-    times = read_times(texts, "start", sheet.place, Problems(), separator=sheet.separator).values
+    times = _times(sheet, roles)
     groups = roles.at.get("recording")
     same = np.diff(sheet.frame.groupby(groups, sort=False).ngroup()) == 0 if groups else np.ones(len(times) - 1, bool)
     steps = np.diff(times)[same]

@@ -77,6 +77,12 @@ def read_json(text: str, label: str) -> tuple[pd.DataFrame, bool]:
             document = [json.loads(line) for line in text.splitlines() if line.strip()]
         except ValueError:
             raise ReadingError(f"{label}: the file must be whole JSON, got {error}") from None
+    if isinstance(document, dict) and document:
+        if _are_bouts(document):
+            return pd.DataFrame(_rows_of_bouts(document)), True
+        if all(map(_are_bouts, document.values())):
+            rows = [{"recording": name} | row for name, bouts in document.items() for row in _rows_of_bouts(bouts)]
+            return pd.DataFrame(rows), True
     while (
         isinstance(document, dict)
         and len(document) == 1
@@ -91,14 +97,6 @@ def read_json(text: str, label: str) -> tuple[pd.DataFrame, bool]:
     if isinstance(document, dict) and {"schema", "data"} <= document.keys():
         document = document["data"]
     members = [*document.values()] if isinstance(document, dict) else document if isinstance(document, list) else []
-    if members is not document and members and all(map(_are_bouts, members)):
-        bouts = [
-            {"recording": name, "behaviour": behaviour, "start": start, "stop": stop}
-            for name, behaviours in document.items()
-            for behaviour, spans in behaviours.items()
-            for start, stop in spans
-        ]
-        return pd.DataFrame(bouts, columns=["recording", "behaviour", "start", "stop"]), True
     if members and all(isinstance(one, dict) for one in members):
         frame = _frame_of_records(members, label) if members is document else pd.DataFrame(document)
         if not frame.map(lambda cell: isinstance(cell, dict | list)).any(axis=None):
@@ -116,10 +114,20 @@ def read_json(text: str, label: str) -> tuple[pd.DataFrame, bool]:
 
 def _are_bouts(value: Any) -> bool:
     """Return whether a value is an object of lists, by behaviour, of starts with their stops."""
-    return isinstance(value, dict) and all(
-        isinstance(spans, list) and all(isinstance(span, list) and len(span) == 2 for span in spans)
-        for spans in value.values()
+    lists = isinstance(value, dict) and all(isinstance(spans, list) for spans in value.values())
+    spans = [span for spans in value.values() for span in spans] if lists else []
+    return bool(spans) and all(
+        isinstance(span, list) and len(span) == 2 and all(isinstance(end, int | float | None) for end in span)
+        for span in spans
     )
+
+
+def _rows_of_bouts(bouts: dict[str, list[list[float | None]]]) -> list[dict[str, Any]]:
+    return [
+        {"behaviour": behaviour, "start": start, "stop": stop}
+        for behaviour, spans in bouts.items()
+        for start, stop in spans
+    ]
 
 
 def _are_labels(value: Any) -> bool:

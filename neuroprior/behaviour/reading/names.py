@@ -5,7 +5,7 @@ import unicodedata
 from typing import NamedTuple
 
 TIME_UNITS = {
-    "s": "s|secs?|seconds?|sf", "ms": "ms|msecs?|milliseconds?", "us": "us|µs|μs|microseconds?",
+    "s": "s|secs?|seconds?|sf", "ms": "ms|msecs?|milliseconds?", "us": "usec|µs|μs|microseconds?",
     "min": "min|mins|minutes?", "h": "h|hrs?|hours?",
 }  # fmt: skip
 """Units of time, and how names of columns write them."""
@@ -37,10 +37,27 @@ KINDS_OF_SUBJECTS = (
     "worker",
 )
 ANIMALS = ("monkey", "dog", "cat", "fish", "fly", "pig", "cow", "sheep", "goat", "horse", "hen", "larva", "worm", "bee")
+ACTORS = ("customer", "visitor", "worker")
 HOUSINGS = ("cage", "tank", "box", "chamber")
-"""Columns that tell subjects apart where no other does; housings where no column tells recordings apart either."""
+"""Columns that tell subjects apart where no other does, and rows of one stand together; housings where no column tells
+recordings apart either."""
 
-KEYS_OF_SUBJECTS = ("id", "no", "nr", "number", "name", "code", "#", "tag", "rfid")
+OF_NO_SUBJECT = (
+    "zone",
+    "camera",
+    "site",
+    "bout",
+    "channel",
+    "stimulus",
+    "location",
+    "place",
+    "arena",
+    "trial",
+    "video",
+)
+"""What has numbers, but is no subject, nor are behaviours."""
+
+KEYS_OF_SUBJECTS = ("id", "no", "nr", "name", "#", "tag", "rfid")
 
 PERIODS = ("date", "datum", "day", "week", "visit", "block")
 """Columns within which sessions may be numbered anew."""
@@ -60,8 +77,8 @@ NAMES: dict[str, tuple[str, ...]] = {
         "participant id", "person", "person id", "id", "pid", "ind", "individu", "tier", "case concept name", "case id",
         "case", "idhous",
         "subj", "subj id", "sub", "actor", "initiator", "sujet", "sujeto", *KINDS_OF_SUBJECTS,
-        *(f"{kind} {key}" for kind in (*KINDS_OF_SUBJECTS, *ANIMALS) for key in KEYS_OF_SUBJECTS),
-        *(f"id {kind}" for kind in (*KINDS_OF_SUBJECTS, *ANIMALS)), "rfid", "id no",
+        *(f"{kind} {key}" for kind in (*KINDS_OF_SUBJECTS, *ANIMALS, *ACTORS) for key in KEYS_OF_SUBJECTS),
+        *(f"id {kind}" for kind in (*KINDS_OF_SUBJECTS, *ANIMALS, *ACTORS)), "rfid", "id no",
     ),
     "recording": (
         "recording", "recording id", "session", "session id", "observation", "observation id", "video", "video name",
@@ -111,7 +128,7 @@ def plain(name: str) -> str:
         >>> plain("Start (s)"), plain("case:concept:name"), plain("onset_min"), plain("AnimalID")
         ('start', 'case concept name', 'onset', 'animal id')
     """
-    words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", str(name).strip())
+    words = re.sub(r"(?<=[a-z])(?=(?:I[Dd]|N[or]|Name|Number|Code|Tag)\b)", " ", str(name).strip())
     letters = unicodedata.normalize("NFKD", words.lower())
     short = UNIT_IN_BRACKETS.sub("", "".join(letter for letter in letters if not unicodedata.combining(letter)))
     short = re.sub(r"[\s_.:\-]+", " ", short).strip()
@@ -195,11 +212,16 @@ WORDS = {
 STEM_NUMBER = re.compile(r"(.*?[^\d.])?[._\- ]?(\d+)")
 """A name that ends in a number: its stem, if any, and the number."""
 
-SUMMARY = re.compile(r"\b(?:total|mean|median|average|std|sd|number of|frequency|occurr?ences)\b|^number$")
+COUNTED = "|".join(
+    ("device", "trial", "event", "session", "block", "row", "line", "frame", "sample", "serial", "index")
+)
+SUMMARY = re.compile(
+    rf"\b(?:total|mean|median|average|std|sd|frequency|occurr?ences)\b|^(?!(?:{COUNTED}) number$).*\bnumber\b"
+)
 """Occurs in names of columns that sum events up."""
 
-SURE_SEPARATORS = (" > ", "->", "|", ";")
-"""Separators of behaviours in a sequence in one cell that stand in no behaviour's name."""
+SURE_SEPARATORS = (" > ", "->", "|")
+"""Separators of behaviours in a sequence in one cell that stand in few behaviours' names."""
 
 TOTALS = ("total", "totals", "sum", "gesamt", "summe")
 """What stands for a behaviour in a row that sums up those above it, in lower case."""

@@ -19,7 +19,8 @@ from neuroprior.behaviour.reading.names import NAMES, plain
 from neuroprior.behaviour.reading.options import Options
 from neuroprior.behaviour.reading.problems import Problems, ReadingError
 from neuroprior.behaviour.reading.sheets import Sheet, find_files, read_sheets, sheet_of_frame
-from neuroprior.behaviour.reading.table import JOIN, MAX_OVERLAP, SECONDS, Part, Table, overlapping
+from neuroprior.behaviour.reading.table import JOIN, MAX_OVERLAP, Part, Table, overlapping
+from neuroprior.behaviour.reading.times import SECONDS
 from neuroprior.behaviour.recordings import KEYS, Recordings, Source, near_names
 
 MIN_EVENTS, MAX_SHARE_OF_LABELS = 20, 0.5
@@ -329,7 +330,9 @@ def _combine(readings: list[Part], notes: list[str], options: Options) -> Record
 def _read_levels(events: pd.DataFrame, factors: list[str]) -> list[str]:
     """Empty the cells of factors that hold a word for missing; note those not known, and levels nearly alike."""
     for name in factors:
-        events[name] = events[name].where(~events[name].str.lower().isin(MISSING_LABELS), "")
+        missing = events[name].str.lower().isin(MISSING_LABELS)
+        if events[name][~missing].nunique() > 1:  # else "+" and "-", or "wt" and "null", are the two levels
+            events[name] = events[name].where(~missing, "")
     recordings, notes = events.drop_duplicates(["recording", "subject"]), []
     for name in factors:
         for level, others in near_names(sorted(pd.unique(recordings[name]))).items():

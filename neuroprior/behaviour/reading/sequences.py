@@ -7,18 +7,21 @@ import numpy as np
 import pandas as pd
 
 from neuroprior.behaviour.reading.names import SEQUENCE_MISSING, SURE_SEPARATORS, plain
+from neuroprior.behaviour.reading.problems import ReadingError
 from neuroprior.behaviour.reading.table import Part, Table
 
 STATE_AND_DURATION = re.compile(r"\(?([^(),]+),\s*(\d+(?:\.\d+)?)\)?")
-SEPARATORS = (*SURE_SEPARATORS, "-", ",", " ", "/")
+SEPARATORS = (*SURE_SEPARATORS, ";", "-", ",", " ", "/")
 """Separators of behaviours in a sequence in one cell."""
 
+ARROWS = (" > ", "->")
 LIST = r"\[.*\]|\(.*\)|\{.*\}"
 """A list that a program has written as a text."""
 
 CALLED_SEQUENCES = ("sequence", "seq", "sequences", "string", "song")
-MIN_LETTERS, MIN_RECURRENCE = 5, 4
-"""Letters of a sequence, and how often each occurs, in the mean at least, where letters are behaviours."""
+MIN_LETTERS, MAX_KINDS, MIN_RECURRENCE = 5, 12, 4
+"""Letters of a sequence in the mean at least, different ones at most, and how often each occurs at least in the mean,
+where letters are behaviours."""
 
 MIN_SEPARATED = 0.3
 """Share of cells with a separator, at least, for cells to be sequences."""
@@ -56,9 +59,23 @@ def rows_of_sequences(table: Table) -> Part:
     return reading
 
 
+def _items_of_lists(texts: Any) -> Any:
+    """Return the items of lists with commas between them, parted by commas or, of numbers, by spaces; None for none."""
+    inside = texts.str.slice(1, -1).str.strip()
+    if inside.str.contains("...", regex=False).any():
+        raise ReadingError(f"lists must be whole, got {texts[inside.str.contains('...', regex=False)].iloc[0]!r}")
+    if inside.str.contains(",", regex=False).any():
+        return inside.str.replace(r"['\"]", "", regex=True).str.replace(r"\s*,\s*", ",", regex=True)
+    if inside.str.fullmatch(r"(-?\d+\s*)+").all() and inside.str.contains(r"\s").any():
+        return inside.str.replace(r"\s+", ",", regex=True)
+    return None
+
+
 def _are_letters(texts: Any) -> bool:
     """Return whether texts are strings of letters or digits that are behaviours: no text recurs, but letters do."""
     together = "".join(texts)
+    if len(set(together)) > MAX_KINDS or pd.to_numeric(texts, errors="coerce").is_monotonic_increasing:
+        return False
     return bool(
         texts.str.fullmatch(r"[^\W\d_]+|\d+").all()
         and texts.str.len().mean() >= MIN_LETTERS
@@ -95,17 +112,16 @@ def strings_of_sequences(table: Table) -> Part | None:
     is_sequence = plain(names[0]) in CALLED_SEQUENCES or not table.sheet.header
     separator, letters = "", False
     if timed.mean() <= 0.9:
-        if filled.str.fullmatch(LIST).all():
-            is_sequence, filled = True, filled.str.replace(r"^.|.$|['\"]", "", regex=True).str.strip()
-            filled = filled.str.replace(r"\s*,\s*|\s+", ",", regex=True)
+        if filled.str.fullmatch(LIST).all() and (inside := _items_of_lists(filled)) is not None:
+            is_sequence, filled = True, inside
             cells = cells.where(cells == "", filled.reindex(cells.index))
         keys = pd.Series(list(zip(table.recording, table.subject, strict=True)))
         counts = {one: float(filled.str.contains(one, regex=False).mean()) for one in SEPARATORS}
         alone = is_sequence or ("subject" in table.roles.at and keys.is_unique)
-        alone = alone or (counts[" > "] > 0.9 or counts["->"] > 0.9)
+        alone = alone or any(counts[one] > 0.9 and filled.str.count(re.escape(one)).max() > 1 for one in ARROWS)
         separator = max(SEPARATORS, key=lambda one: counts[one])
         separator = _best_separator(filled, [one for one in SEPARATORS if counts[one] >= MIN_SEPARATED]) or separator
-        letters = is_sequence and counts[separator] == 0 and _are_letters(filled)
+        letters = plain(names[0]) in CALLED_SEQUENCES and counts[separator] == 0 and _are_letters(filled)
         if not alone or (counts[separator] < MIN_SEPARATED and not letters):
             return None
         pieces = [word for text in filled for word in (text if letters else text.split(separator))]

@@ -49,6 +49,9 @@ TABLE_SUFFIXES = (
 )
 """Suffixes of the files of a folder that are read; .gz or .zip may follow."""
 
+HIDDEN = re.compile(r"__MACOSX$|\.[^.]")
+"""Parts of paths in archives that are not read."""
+
 HEADER_LINES = re.compile(r"number of header lines:?", re.IGNORECASE)
 NUMBER = re.compile(r"\s*[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?\s*")
 
@@ -199,7 +202,11 @@ def _sheets_of_zip(content: bytes, name: str, label: str, stem: str, wanted: Seq
     if "[Content_Types].xml" in members or b"opendocument" in kind:
         yield from _sheets_of_workbook(content, label, stem, wanted)
         return
-    tables = [member for member in members if not any(part[0] in "._" for part in Path(member).parts)]
+    tables = [
+        member for member in members if not any(part == "__MACOSX" or part[0] == "." for part in Path(member).parts)
+    ]
+    if not tables:
+        raise ReadingError(f"{label}: the archive must hold tables, got none")
     names = [Path(member).name for member in tables]
     for member, member_name in zip(tables, names, strict=True):
         called = label if len(tables) == 1 else f"{label}, {member}"

@@ -9,20 +9,17 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from neuroprior.behaviour.reading.columns import Roles
-from neuroprior.behaviour.reading.names import NO_SUBJECT, TIME_UNITS, TOTALS, plain
+from neuroprior.behaviour.reading.names import NO_SUBJECT, TOTALS, plain
 from neuroprior.behaviour.reading.options import Options
 from neuroprior.behaviour.reading.problems import Problems
 from neuroprior.behaviour.reading.sheets import Sheet
-from neuroprior.behaviour.reading.times import NUMBERS, Times, over_midnight, read_times
+from neuroprior.behaviour.reading.times import NUMBERS, SECONDS, Times, over_midnight, read_times, unit_of_name
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 JOIN = "|"
 """Between the labels of several columns."""
-
-SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0, "h": 3600.0}
-"""Seconds of the units of time that can be converted."""
 
 UNIT_CELL = re.compile(r"\(?(s|ms|sec|seconds|min|frames|h|)\)?", re.IGNORECASE)
 """A cell of a row of units below the header."""
@@ -221,7 +218,7 @@ class Table:
             texts, use, self.place, self.problems, separator=self.sheet.separator, day_first=self.options.day_first
         )
         if use == "start":
-            self.unit = (_unit_of_name(names[0]) or self.unit) if times.kind == NUMBERS else "s"
+            self.unit = (unit_of_name(names[0]) or self.unit) if times.kind == NUMBERS else "s"
         elif times.kind == NUMBERS:
             return self._convert_to_unit_of_starts(use, names[0], times)
         return times
@@ -232,7 +229,7 @@ class Table:
         Frames beside seconds cannot be compared: a column that no user named is left out, a named one is an error.
         """
         start = self.roles.at.get("start", [""])[-1]
-        unit, start_unit = _unit_of_name(name), _unit_of_name(start)
+        unit, start_unit = unit_of_name(name), unit_of_name(start)
         if not start:
             self.unit = self.unit or unit
         if not unit or not start_unit or unit == start_unit:
@@ -388,15 +385,6 @@ def _whole_numbers(keys: NDArray[Any]) -> NDArray[Any]:
     if len(values) and all(re.fullmatch(r"-?\d+\.0|", str(value)) for value in values):
         return np.array([str(value).removesuffix(".0") for value in values], dtype=object)[codes]
     return keys
-
-
-def _unit_of_name(name: str) -> str:
-    """Return the unit of time that the name of a column says; "" for none."""
-    low = name.lower()
-    if "frame" in low or "image" in low:
-        return "frames"
-    words = low.replace("_", " ")
-    return next((unit for unit, names in TIME_UNITS.items() if re.search(rf"\b({names})\b", words)), "")
 
 
 def overlapping(unit: Integers, start: Floats, stop: Floats) -> Integers:

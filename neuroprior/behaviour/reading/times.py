@@ -1,5 +1,6 @@
 """Times in texts: numbers, times of day, dates and durations, in the unit of the column or in seconds."""
 
+import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -7,6 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from neuroprior.behaviour.reading.names import TIME_UNITS
 from neuroprior.behaviour.reading.problems import Place, Problems
 
 Floats = NDArray[np.float64]
@@ -25,6 +27,9 @@ NUMBERS, CLOCKS, DATES = "numbers", "times of day", "dates"
 
 DAY = 86400.0
 """Seconds."""
+
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0, "h": 3600.0}
+"""Seconds of the units of time that can be converted."""
 
 MAX_SAMPLE = 2_000
 """Texts at most by which a column is judged to hold times."""
@@ -210,3 +215,12 @@ def smallest_unit(texts: NDArray[Any]) -> float:
     words = pd.Series(pd.unique(np.asarray(texts, dtype=object)), dtype=object)
     decimals = words.str.extract(r"[.,](\d+)$")[0].dropna().str.rstrip("0").str.len()
     return float(10.0 ** -(int(decimals.max()) if len(decimals) else 0))
+
+
+def unit_of_name(name: str) -> str:
+    """Return the unit of time that the name of a column says; "" for none."""
+    low = name.lower()
+    if "frame" in low or "image" in low:
+        return "frames"
+    words = low.replace("_", " ")
+    return next((unit for unit, names in TIME_UNITS.items() if re.search(rf"\b({names})\b", words)), "")

@@ -540,8 +540,8 @@ def test_a_factor_that_is_empty_in_some_recordings_is_noted(study):
         ("AnimalID,time,behaviour\nm1,0,x\nm2,1,y\nm1,2,x\nm2,3,z\n", ["xx", "yz"]),
         ("Tier-Nr.;Zeit;Verhalten\nm1;0;x\nm2;1;y\nm1;2;x\nm2;3;z\n", ["xx", "yz"]),
         ("Participant name,time,behaviour\nm1,0,x\nm2,1,y\nm1,2,x\nm2,3,z\n", ["xx", "yz"]),
-        ("dog,time,behaviour\nm1,0,x\nm2,1,y\nm1,2,x\nm2,3,z\n", ["xx", "yz"]),
-        ("cage,time,behaviour\nm1,0,x\nm2,1,y\nm1,2,x\nm2,3,z\n", ["xx", "yz"]),
+        ("dog,time,behaviour\nm1,0,x\nm1,2,x\nm2,1,y\nm2,3,z\n", ["xx", "yz"]),
+        ("cage,time,behaviour\nm1,0,x\nm1,2,x\nm2,1,y\nm2,3,z\n", ["xx", "yz"]),
         # Merged cells.
         ("animal,session,behaviour\na,1,x\n,,y\n,2,z\n,,x\nb,1,x\n,,x\n", ["xy", "zx", "xx"]),
         # Sequences as lists, paths, letters, and beside another text.
@@ -550,6 +550,13 @@ def test_a_factor_that_is_empty_in_some_recordings_is_noted(study):
         ("visitor,path\na,x > y > x\nb,z > x\nb,x > z\n", ["xyx", "zx", "xz"]),
         ("id,sequence\na,XYXXYZXXYX\nb,YXYYXZYYXX\nc,ZZYXX\n", ["XYXXYZXXYX", "YXYYXZYYXX", "ZZYXX"]),
         ("id,codes,outcome\na,x|y|x,alive\nb,y|x,dead\nc,x|z,dead\nd,y|y,alive\n", ["xyx", "yx", "xz", "yy"]),
+        # What looks alike, and is not: a week that was entered twice, kinds of blocks, numbers of what has none.
+        ("id,week,state\na,1,x\na,2,y\na,3,x\na,3,z\na,4,y\nb,1,x\nb,2,x\n", ["xyxzy", "xx"]),
+        ("id,trial,block,choice\na,1,easy,l\na,2,easy,r\na,3,hard,l\na,4,hard,l\na,5,easy,r\na,6,easy,r\n", ["lrllrr"]),
+        ("time,behaviour,BehaviourID\n0,x,1\n1,y,2\n2,x,1\n3,z,3\n", ["xyxz"]),
+        ("time,behaviour,cat\n0,x,self\n1,y,food\n2,x,self\n3,z,food\n", ["xyxz"]),
+        ("TimeStamp,behaviour\n5,x\n2,y\n9,x\n7,z\n", ["yxzx"]),
+        ("id,seq\na,\"['x y', 'z']\"\nb,\"['z', 'x y', 'z']\"\n", ["x yz", "zx yz"]),
         # Columns of subjects, of which one shows few of the labels of the others.
         ("time,Anna,Ben,Carl\n0,x,z,x\n1,x,z,x\n2,y,x,x\n3,y,x,z\n4,x,x,z\n", ["xyx", "zx", "xz"]),
     ],
@@ -580,10 +587,27 @@ def test_words_for_missing_are_no_levels_and_levels_alike_are_noted(study):
     assert "the levels 'Drug' and 'drug' of 'treatment' are nearly alike" in found.notes
 
 
+def test_two_levels_may_be_words_for_missing(study):
+    for other in ("null", "-", "NA"):
+        found = study(f"id,genotype,behaviour\n1,wt,x\n2,{other},x\n3,{other},y\n4,wt,x\n")
+        assert list(found.events["genotype"]) == ["wt", other, other, "wt"]
+
+
+def test_levels_go_on_within_a_subject_alone(study):
+    found = study("id,treatment,behaviour\na,drug,x\na,,y\na,,x\nb,,x\nb,,y\nc,saline,x\nc,,x\n")
+    assert list(found.events["treatment"]) == ["drug"] * 3 + [""] * 2 + ["saline"] * 2
+
+
+def test_one_behaviour_a_row_in_columns_beside_starts_and_stops(study):
+    found = study("start,stop,x,y,z\n0,4,1,0,0\n4,5,0,1,0\n5,11,1,0,0\n11,13,0,0,1\n")
+    assert labels(found) == [["x", "y", "x", "z"]]
+
+
 def test_objects_of_bouts(study):
     text = '{"v1": {"x": [[0, 1], [4, 6]], "y": [[1, 4]]}, "v2": {"y": [[2, 3]]}}'
     due = [("v1", "x", 0, 1), ("v1", "y", 1, 4), ("v1", "x", 4, 6), ("v2", "y", 2, 3)]
     assert rows(study(text, name="f.json")) == due
+    assert rows(study('{"x": [[0, 1], [4, null]]}', name="f.json")) == [("f", "x", 0, 1), ("f", "x", 4, None)]
 
 
 @pytest.mark.parametrize(
@@ -592,6 +616,11 @@ def test_objects_of_bouts(study):
         ("animal,corner,correct,start,end\na,3,1,1,5.5\nb,1,0,20,23\na,2,1,30,33\n", "f.csv", "must hold behaviours"),
         ("2024-05-01 08:00:00,a,x\n2024-05-01 08:01:00,a,y\n2024-05-01 08:07:00,b,x\n", "f.csv", "must have a header"),
         ("[2024-05-01 08:00:00] a x y\n[2024-05-01 08:01:00] a y\n[2024-05-01 08:07:00] b\n", "f.txt", "must hold"),
+        ("start_h,start_min,start_s,behaviour\n9,5,30,x\n9,5,41,y\n9,6,2,x\n", "f.csv", "must stand in one column"),
+        ("id,seq\na,[1 2 ... 3 1]\nb,[2 2 ... 1 3]\n", "f.csv", "lists must be whole"),
+        ("giraffe\nelephant\nlion\n" + "".join(f"{a}{b}ant\n" for a in "dghklmnp" for b in "aeo"), "f.txt", "recur"),
+        ("subject,behaviour,bout number\na,x,3\na,y,5\nb,x,2\nb,y,7\n", "f.csv", "totals"),
+        ('{"m1": {"x": [[{"y": 1}, 2]]}, "m2": {"x": [[1, 2]]}}', "f.json", "another form"),
         ('{"meta": {"v": ["x", "y"]}, "s": {"i": {"t": {"labels": [3, 3, 0]}}}}', "f.json", "another form"),
     ],
 )
@@ -633,6 +662,13 @@ def test_labels_that_end_in_start_and_stop(study):
     assert rows(found) == [("a", "rest", 0, 3), ("a", "walk", 1, 4), ("b", "rest", 2, 9)]
     one = study("animal,time,event\na,0,lights on\na,2,rest\na,5,lights off\n")
     assert labels(one) == [["lights on", "rest", "lights off"]]
+    jumps = study("animal,time,event\na,0,jump on\na,2,jump on\na,5,jump off\na,6,jump off\nb,3,jump on\nb,4,jump on\n")
+    assert labels(jumps) == [["jump on", "jump on", "jump off", "jump off"], ["jump on", "jump on"]]
+
+
+def test_the_length_of_the_session_is_no_duration(study):
+    found = study("animal,time,behaviour,length_min\na,0,x,10\na,5,y,10\na,9,x,10\n")
+    assert rows(found) == [("a", "x", 0, None), ("a", "y", 5, None), ("a", "x", 9, None)]
 
 
 def test_a_stop_before_its_start_is_shown_as_it_is_written(study):
