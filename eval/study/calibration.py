@@ -187,7 +187,7 @@ def intervals(plans: RecordedPlans, permutations: int, generator: torch.Generato
     between = transitions(plans, 1, generator, by="condition")
     estimates = {f"transition 0 to {to}": _cell(within, 0, to) for to in (1, 3)}
     estimates["transition 0 to 1, treated"] = _cell(between, 2, 1)
-    for family, feature in (("actions", (1,)), ("transitions", (0, 1)), ("durations", (1,))):
+    for family, feature in (("behaviours", (1,)), ("transitions", (0, 1)), ("durations", (1,))):
         for one in conditions.families:
             at = [place for place, parts in enumerate(one.features.tolist()) if tuple(parts) == feature]
             if one.name == family and at:
