@@ -28,7 +28,7 @@ HOURS = {
     "macro-actions": "2",
     "agents": "0.5",
     "quality": "2.1",
-    "calibration": "0.4",
+    "calibration": "1.2",
     "speed": "0.8+",
 }
 """By page: the hours that it states, on one or two cores; + where it states them for some of its commands only."""
