@@ -188,7 +188,7 @@ def find_roles(sheet: Sheet, columns: Columns, words: Mapping[str, str]) -> Role
     _choose_layout(sheet, roles, words)
     if program is None and roles.layout != "rows of sequences":
         _fill_down(sheet, roles)
-    if "recording" not in closed and roles.layout != "rows of sequences":
+    if "recording" not in closed:
         _choose_recordings(sheet, roles)
     _check_direction(sheet, roles)
     if roles.layout == "rows of sequences":
@@ -410,10 +410,11 @@ def _choose_recordings(sheet: Sheet, roles: Roles) -> None:
     """
     chosen: list[str] = []
     subjects, candidates = roles.at.get("subject", []), roles.at.pop("recording", [])
-    may_count = len(sheet.frame) > 2 and (not subjects or bool(sheet.frame.duplicated(subjects).any()))
+    are_rows = roles.layout != "rows of sequences"
+    may_count = are_rows and len(sheet.frame) > 2 and (not subjects or bool(sheet.frame.duplicated(subjects).any()))
     behaviour = sheet.frame[roles.at["behaviour"]]
     recur = bool(behaviour.duplicated().mean() >= 0.5)  # where none does, each may be a sequence
-    for name in [*_periods(sheet, roles, candidates), *candidates]:
+    for name in [*(_periods(sheet, roles, candidates) if are_rows else []), *candidates]:
         groups = sheet.frame.groupby([*chosen, name], sort=False).ngroups
         before = sheet.frame.groupby(chosen, sort=False).ngroups if chosen else 0
         within = chosen if recur and _rise(sheet, roles, [*subjects, *chosen]) else []

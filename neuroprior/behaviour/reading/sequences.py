@@ -59,11 +59,11 @@ def rows_of_sequences(table: Table) -> Part:
     return reading
 
 
-def _items_of_lists(texts: Any) -> Any:
+def _items_of_lists(table: Table, texts: Any) -> Any:
     """Return the items of lists with commas between them, parted by commas or, of numbers, by spaces; None for none."""
     inside = texts.str.slice(1, -1).str.strip()
-    if inside.str.contains("...", regex=False).any():
-        raise ReadingError(f"lists must be whole, got {texts[inside.str.contains('...', regex=False)].iloc[0]!r}")
+    if (cut := inside.str.contains("...", regex=False)).any():
+        raise ReadingError(f"{table.place(int(cut.idxmax()))}: lists must be whole, got {texts[cut].iloc[0]!r}")
     if inside.str.contains(",", regex=False).any():
         return inside.str.replace(r"['\"]", "", regex=True).str.replace(r"\s*,\s*", ",", regex=True)
     if inside.str.fullmatch(r"(-?\d+\s*)+").all() and inside.str.contains(r"\s").any():
@@ -112,7 +112,7 @@ def strings_of_sequences(table: Table) -> Part | None:
     is_sequence = plain(names[0]) in CALLED_SEQUENCES or not table.sheet.header
     separator, letters = "", False
     if timed.mean() <= 0.9:
-        if filled.str.fullmatch(LIST).all() and (inside := _items_of_lists(filled)) is not None:
+        if filled.str.fullmatch(LIST).all() and (inside := _items_of_lists(table, filled)) is not None:
             is_sequence, filled = True, inside
             cells = cells.where(cells == "", filled.reindex(cells.index))
         keys = pd.Series(list(zip(table.recording, table.subject, strict=True)))

@@ -587,6 +587,11 @@ def test_words_for_missing_are_no_levels_and_levels_alike_are_noted(study):
     assert "the levels 'Drug' and 'drug' of 'treatment' are nearly alike" in found.notes
 
 
+def test_recordings_of_sequences_are_named_by_what_divides_them(study):
+    found = study("session,file,a1,a2,a3\n1,f1,x,y,x\n2,f2,y,y,x\n3,f3,x,x,z\n")
+    assert list(found.events["recording"].unique()) == ["1", "2", "3"]
+
+
 def test_two_levels_may_be_words_for_missing(study):
     for other in ("null", "-", "NA"):
         found = study(f"id,genotype,behaviour\n1,wt,x\n2,{other},x\n3,{other},y\n4,wt,x\n")
@@ -617,7 +622,7 @@ def test_objects_of_bouts(study):
         ("2024-05-01 08:00:00,a,x\n2024-05-01 08:01:00,a,y\n2024-05-01 08:07:00,b,x\n", "f.csv", "must have a header"),
         ("[2024-05-01 08:00:00] a x y\n[2024-05-01 08:01:00] a y\n[2024-05-01 08:07:00] b\n", "f.txt", "must hold"),
         ("start_h,start_min,start_s,behaviour\n9,5,30,x\n9,5,41,y\n9,6,2,x\n", "f.csv", "must stand in one column"),
-        ("id,seq\na,[1 2 ... 3 1]\nb,[2 2 ... 1 3]\n", "f.csv", "lists must be whole"),
+        ("id,seq\na,[1 2 ... 3 1]\nb,[2 2 ... 1 3]\n", "f.csv", "line 2: lists must be whole"),
         ("giraffe\nelephant\nlion\n" + "".join(f"{a}{b}ant\n" for a in "dghklmnp" for b in "aeo"), "f.txt", "recur"),
         ("subject,behaviour,bout number\na,x,3\na,y,5\nb,x,2\nb,y,7\n", "f.csv", "totals"),
         ('{"m1": {"x": [[{"y": 1}, 2]]}, "m2": {"x": [[1, 2]]}}', "f.json", "another form"),
