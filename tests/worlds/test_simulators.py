@@ -544,3 +544,25 @@ def test_simulators_that_hold_the_same_are_found():
     assert not world.are_same(torch.cat([state, world.step(state, torch.ones(5, dtype=torch.long))[0]]))
     noisy = from_simulator(simulators.NoisyStart)
     assert not noisy.are_same(noisy.reset(40, seeded(0)))
+
+
+class Forgetful:
+    """It counts its steps, and misbehaves from the third one on once `returns` is set."""
+
+    returns = ()
+
+    def __init__(self):
+        self.t = 0
+
+    def step(self, action):
+        self.t += 1
+        return (None, float(action), False) if self.t < 3 or not Forgetful.returns else Forgetful.returns[0]
+
+
+@pytest.mark.parametrize("returned", [None, (None, None, False), (None, 1.0)])
+def test_what_a_step_returns_late_is_refused_in_a_line(returned, monkeypatch):
+    world = from_simulator(Forgetful(), num_actions=2)
+    monkeypatch.setattr(Forgetful, "returns", (returned,))
+    assert world.rollout(world.reset(1), torch.tensor([[[1, 0]]])).rewards.tolist() == [[[1, 0]]]
+    with refuses("`step` must return (observation, reward, ended)"):
+        world.rollout(world.reset(1), torch.tensor([[[1, 0, 1, 1]]]))

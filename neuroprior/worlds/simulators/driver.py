@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from neuroprior._checks import kind_of
 from neuroprior.worlds.observations import Categories, Features
 from neuroprior.worlds.simulators.copies import Copier
 from neuroprior.worlds.simulators.generators import (
@@ -203,9 +204,15 @@ class Driver:
         step, first, rewards, ended = simulator.step, self.first_action, list[float](), False
         for action in actions:
             result = step(action + first)
-            rewards.append(float(result[1]))  # now: a simulator may return the same array again
-            if result[2] or (len(result) == 5 and result[3]):
-                ended = True
+            try:
+                rewards.append(float(result[1]))  # now: a simulator may return the same array again
+                ended = bool(result[2] or (len(result) == 5 and result[3]))
+            except (TypeError, ValueError, IndexError) as error:
+                raise ValueError(
+                    f"`step` must return (observation, reward, ended) or Gymnasium's five, of which the reward is a"
+                    f" number, got {kind_of(result)} ({error})"
+                ) from error
+            if ended:
                 break
         return Path(list(actions[: len(rewards)]), rewards, [], [], ended)
 
