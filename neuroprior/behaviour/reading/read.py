@@ -26,6 +26,9 @@ from neuroprior.behaviour.recordings import KEYS, Recordings, Source, near_names
 MIN_EVENTS, MAX_SHARE_OF_LABELS = 20, 0.5
 """Events at least, of which this share at most may have a label of their own: what never recurs is no behaviour."""
 
+MIN_SHARE_OF_SHEET = 0.2
+"""Of the events of the largest sheet of a workbook, at least, which the sheet has that is read."""
+
 MIN_TWIN_EVENTS, MIN_TWIN_SHARE = 4, 0.6
 """Events of two recordings, and the share of them at the same time, at least which two observers may have scored."""
 
@@ -121,29 +124,27 @@ def _words_of_columns(columns: Columns) -> list[str]:
 
 
 def _read_file(sheets: list[Sheet], options: Options) -> tuple[list[Part], list[str], list[str]]:
-    """Return the parts, notes and problems of a file; of a workbook, the parts like the first that can be read."""
-    parts: list[Part] = []
-    unread: list[str] = []
-    problems: list[str] = []
-    failed: list[set[str]] = []
-    names: list[str] = []
-    of_first: set[str] = set()
+    """Return the parts, notes and problems of a file; of a workbook, those of the sheets with the columns of one.
+
+    It is the first that has not far fewer events than another, as a legend before the events has.
+    """
+    parts: list[tuple[set[str], Part]] = []
+    failed: list[tuple[set[str], str, Sequence[str]]] = []
     for sheet in sheets:
         columns = set(sheet.frame.columns)
-        if sheet.of_workbook and parts and columns != of_first:
-            unread.append(sheet.name)
-            continue
         try:
-            parts.append(_read_sheet(sheet, options))
-            of_first = of_first or columns
+            parts.append((columns, _read_sheet(sheet, options)))
         except ReadingError as error:
-            problems += error.problems
-            failed.append(columns)
-            names.append(sheet.name)
-    if parts and sheets[0].of_workbook and of_first not in failed:
-        # A sheet of another kind, such as the ethogram, may stand before or behind that of the events.
-        unread, problems = unread + names, []
-    return parts, [f"{', '.join(unread)}: not read, since the columns are others"] if unread else [], problems
+            failed.append((columns, sheet.name, error.problems))
+    if not parts or not sheets[0].of_workbook:
+        return [part for _, part in parts], [], [problem for _, _, problems in failed for problem in problems]
+    most = max(len(part.events) for _, part in parts)
+    chosen = next(columns for columns, part in parts if len(part.events) >= MIN_SHARE_OF_SHEET * most)
+    unread = [part.sheet.name for columns, part in parts if columns != chosen]
+    unread += [name for columns, name, _ in failed if columns != chosen]
+    problems = [problem for columns, _, of_sheet in failed if columns == chosen for problem in of_sheet]
+    kept = [part for columns, part in parts if columns == chosen]
+    return kept, [f"{', '.join(unread)}: not read, since the columns are others"] if unread else [], problems
 
 
 def _read_sheet(sheet: Sheet, options: Options) -> Part:

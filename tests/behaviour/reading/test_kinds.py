@@ -681,3 +681,16 @@ def test_a_stop_before_its_start_is_shown_as_it_is_written(study):
         study(
             "animal,behaviour,start,stop\na,x,2024-10-27 02:55,2024-10-27 02:05\na,y,2024-10-27 03:00,2024-10-27 03:10"
         )
+
+
+@pytest.mark.parametrize("legend_first", [True, False])
+def test_the_sheet_of_the_events_is_read_wherever_the_legend_stands(legend_first, tmp_path):
+    events = pd.DataFrame({"animal": [*"aabbab" * 2], "time": range(12), "behaviour": [*"xyxyzz" * 2]})
+    legend = pd.DataFrame({"code": ["x", "y"], "behaviour": ["rest", "walk"]})
+    pages = [("Ethogram", legend), ("Data", events), ("More", events.assign(animal="c"))]
+    with pd.ExcelWriter(tmp_path / "f.xlsx") as file:
+        for name, page in pages if legend_first else [*pages[1:], pages[0]]:
+            page.to_excel(file, sheet_name=name, index=False)
+    found = read(tmp_path / "f.xlsx")
+    assert (len(found.events), set(found.events["subject"])) == (24, {"a", "b", "c"})
+    assert any("Ethogram" in note and "not read" in note for note in found.notes)
