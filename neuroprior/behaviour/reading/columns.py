@@ -15,6 +15,7 @@ from neuroprior.behaviour.reading.names import (
     HOUSINGS,
     NAMES,
     OF_NO_SUBJECT,
+    ORDERS,
     PERIODS,
     PROGRAMS,
     SIMBA,
@@ -190,6 +191,8 @@ def find_roles(sheet: Sheet, columns: Columns, words: Mapping[str, str]) -> Role
         _fill_down(sheet, roles)
     if "recording" not in closed:
         _choose_recordings(sheet, roles)
+    if roles.layout == "events" and "start" not in roles.at:
+        _sort_by_numbers(sheet, roles)
     _check_direction(sheet, roles)
     if roles.layout == "rows of sequences":
         for use in ("start", "stop", "duration"):
@@ -425,6 +428,22 @@ def _choose_recordings(sheet: Sheet, roles: Roles) -> None:
             chosen.append(name)
     if chosen:
         roles.infer("recording", chosen)
+
+
+def _sort_by_numbers(sheet: Sheet, roles: Roles) -> None:
+    """Sort the rows of each recording by a column that numbers them, where there is one."""
+    keys = [*roles.at.get("subject", []), *roles.at.get("recording", [])]
+    for name in [name for name in sheet.frame if plain(name) in ORDERS and name not in roles.used()]:
+        numbers = pd.to_numeric(sheet.frame[name], errors="coerce")
+        if numbers.isna().any() or sheet.frame.duplicated([*keys, name]).any():
+            continue
+        group = sheet.frame.groupby(keys, sort=False).ngroup() if keys else pd.Series(0, index=sheet.frame.index)
+        if (numbers.groupby(group).diff().dropna() > 0).all():
+            return
+        order = np.lexsort((numbers, group))
+        sheet.frame, sheet.lines = sheet.frame.iloc[order].reset_index(drop=True), sheet.lines[order]
+        roles.notes.append(f"rows are sorted by the column {name!r}, which numbers them")
+        return
 
 
 def _periods(sheet: Sheet, roles: Roles, recordings: list[str]) -> list[str]:

@@ -209,6 +209,22 @@ WORDS = {
 }  # fmt: skip
 """Words for the kinds of rows where starts and stops have rows of their own, in lower case."""
 
+ORDERS = (
+    "order",
+    "event order",
+    "step",
+    "seq no",
+    "sequence number",
+    "event number",
+    "event no",
+    "trial number",
+    "trial no",
+    "trial",
+    "rank",
+    "position",
+)
+"""Columns that number the events of a recording, where no times do."""
+
 STEM_NUMBER = re.compile(r"(.*?[^\d.])?[._\- ]?(\d+)")
 """A name that ends in a number: its stem, if any, and the number."""
 

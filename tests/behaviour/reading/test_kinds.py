@@ -550,6 +550,9 @@ def test_a_factor_that_is_empty_in_some_recordings_is_noted(study):
         ("visitor,path\na,x > y > x\nb,z > x\nb,x > z\n", ["xyx", "zx", "xz"]),
         ("id,sequence\na,XYXXYZXXYX\nb,YXYYXZYYXX\nc,ZZYXX\n", ["XYXXYZXXYX", "YXYYXZYYXX", "ZZYXX"]),
         ("id,codes,outcome\na,x|y|x,alive\nb,y|x,dead\nc,x|z,dead\nd,y|y,alive\n", ["xyx", "yx", "xz", "yy"]),
+        # Numbers that give the order of rows.
+        ("id,order,behaviour\na,3,x\na,1,y\na,2,z\nb,2,x\nb,1,y\n", ["yzx", "yx"]),
+        ("id,session,trial,choice\na,1,2,l\na,1,1,r\na,1,3,l\nb,1,1,r\nb,1,2,r\n", ["rll", "rr"]),
         # What looks alike, and is not: a week that was entered twice, kinds of blocks, numbers of what has none.
         ("id,week,state\na,1,x\na,2,y\na,3,x\na,3,z\na,4,y\nb,1,x\nb,2,x\n", ["xyxzy", "xx"]),
         ("id,trial,block,choice\na,1,easy,l\na,2,easy,r\na,3,hard,l\na,4,hard,l\na,5,easy,r\na,6,easy,r\n", ["lrllrr"]),
