@@ -103,7 +103,7 @@ class Transitions:
 
     @property
     def name_of_all(self) -> str:
-        """What all groups together are called: "all", but where a group is."""
+        """Return what all groups together are called, which is "all" unless a group is."""
         return "all groups" if "all" in self.group_names else "all"
 
     def graph(self, group: str | None = None) -> nx.DiGraph:
