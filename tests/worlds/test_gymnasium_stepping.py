@@ -188,3 +188,34 @@ def test_what_grows_is_set_back_or_named(name):
 def test_a_stepped_minigrid_conforms():
     pytest.importorskip("minigrid")
     check_world(from_gymnasium("MiniGrid-DoorKey-5x5-v0", method="step", seeds=[0]), num_states=10)
+
+
+class Zoo(gymnasium.Env):
+    """A line of 9 places, on by one or by two; its observation says what is legal, as PettingZoo's do."""
+
+    action_space = gymnasium.spaces.Discrete(2)
+    observation_space = gymnasium.spaces.Dict(
+        {"place": gymnasium.spaces.Discrete(9), "action_mask": gymnasium.spaces.MultiBinary(2)}
+    )
+
+    def observe(self):
+        return {"place": self.place, "action_mask": np.array([True, self.place not in (2, 4)], np.int8)}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place = 0
+        return self.observe(), {}
+
+    def step(self, action):
+        self.place = min(self.place + 1 + int(action), 8)
+        return self.observe(), float(self.place), self.place == 8, False, {}
+
+
+@pytest.mark.parametrize("method", ["step", "enumerate"])
+def test_masks_in_observations_count(method):
+    world = from_gymnasium(Zoo, method=method, progress=False)
+    start = world.reset(1)
+    assert not world.all_legal
+    decision = SamplingPlanner(UniformPrior(2), 4, 64, objective="return").plan(world, start, seeded(0))
+    assert decision.plan.tolist() == [[1, 0, 1, 1]]  # not 2, 4, 6 and 8
+    assert decision.score.tolist() == [2 + 3 + 5 + 7]

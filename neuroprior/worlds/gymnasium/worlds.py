@@ -60,8 +60,9 @@ def from_gymnasium(
     "auto" takes a table where there is one, and the environment does on random walks what it says. It steps where
     observations are real numbers or the environment is stochastic, and enumerates otherwise.
 
-    Legal actions are those of a method `action_masks()` or `action_mask()`, or of `info["action_mask"]`. In tables all
-    are legal: the masks of Taxi's `info` leave out what changes nothing, which its table has with its rewards.
+    Legal actions are those of a method `action_masks()` or `action_mask()`, of `info["action_mask"]`, or of an
+    observation that is a dict, `observation["action_mask"]`. In tables all are legal: the masks of Taxi's `info` leave
+    out what changes nothing, which its table has with its rewards.
 
     An episode that has ended stays in its last state, without rewards. Time limits that are wrappers (`TimeLimit`) are
     removed: plans have a length of their own.

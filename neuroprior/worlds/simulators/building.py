@@ -66,8 +66,8 @@ def from_simulator(
         num_actions: actions are numbered from 0; None: as many as the `action_space` has.
         clone: a function from a simulator to an independent copy.
         legal_actions: a function from a simulator to bool `[A]`. None: by its method `action_masks()` or
-            `action_mask()`, or by `action_mask` in the info of the last step (which is not known before the first
-            step: then all are legal). Where none is legal the episode is over.
+            `action_mask()`, or by `action_mask` in the info of the last step, or in its observation (which are not
+            known before the first step: then all are legal). Where none is legal the episode is over.
         observe: a function from a simulator to what is observed, or "observation": what `step` returned last.
         observation: what `observe` returns, `Categories(number)` or `Features(size)`.
         objective, discount: what counts in this world; see `Planner`.

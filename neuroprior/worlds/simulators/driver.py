@@ -65,6 +65,12 @@ def _same(observation: Any) -> Any:
     return observation
 
 
+def _told_mask(observation: Any, info: Any) -> Any:
+    """The `action_mask` in an info or, as PettingZoo has it, in an observation that is a dict; None for none."""
+    dicts = [told for told in (info, observation) if isinstance(told, dict)]
+    return next((told["action_mask"] for told in dicts if "action_mask" in told), None)
+
+
 class Driver:
     """Steps simulators of one kind, and reads what can be seen and done in them.
 
@@ -72,7 +78,7 @@ class Driver:
         num_actions: A.
         first_action: the number of the first action in the simulator.
         legal_actions: a function from a simulator to its legal actions, bool `[A]`; None: a method of the simulator or
-            the `action_mask` in its info says so, or all are legal.
+            the `action_mask` in its info, or in its observation, says so, or all are legal.
         observe: a function from a simulator to its observation; "observation": what `step` returned last; a `FromStep`:
             a function of that; None: nothing is observed.
         observation: what `observe` returns.
@@ -96,14 +102,14 @@ class Driver:
         self.legal_actions, self.reads_mask = legal_actions, legal_actions is not None
         self.has_masks = self.reads_mask
 
-    def find_masks(self, simulator: Any, info: Any) -> None:
-        """Find out where masks come from: a method of `simulator`, or its `info`."""
+    def find_masks(self, simulator: Any, observation: Any, info: Any) -> None:
+        """Find out where masks come from: a method of `simulator`, its `info`, or its observation."""
         if self.legal_actions is None:
             self.legal_actions = next(
                 (_Method(name) for name in MASK_METHODS if _Method(name).of(simulator) is not None), None
             )
             self.reads_mask = self.legal_actions is not None
-        self.has_masks = self.has_masks or self.reads_mask or (isinstance(info, dict) and "action_mask" in info)
+        self.has_masks = self.has_masks or self.reads_mask or _told_mask(observation, info) is not None
 
     def take(self, simulator: Any, action: int) -> tuple[Any, float, int, Any]:
         """Take an action: the observation, the reward, whether and how the episode ended, and the info.
@@ -133,8 +139,8 @@ class Driver:
         if self.reads_mask:
             assert self.legal_actions is not None
             mask = self.legal_actions(simulator)
-        elif isinstance(info, dict):
-            mask = info.get("action_mask")
+        else:
+            mask = _told_mask(observation, info)
         if mask is not None:
             mask = np.asarray(mask)
             if mask.shape != (self.num_actions,):

@@ -172,7 +172,7 @@ def _moment(driver: Driver, simulator: Any, action: int) -> tuple[Moment, View]:
         raise ValueError(
             f"`simulator` must step by each action, or say which are legal; action {action} raised {reason}"
         ) from error
-    driver.find_masks(simulator, info)
+    driver.find_masks(simulator, observation, info)
     view = driver.view(simulator, observation, info)
     seen = fingerprint([observation, view.observation])
     return Moment(

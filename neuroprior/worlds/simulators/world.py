@@ -435,7 +435,7 @@ def enter(driver: Driver, copier: Copier, simulator: Any, observation: Any, info
         raise ValueError(f"`simulator` must have a method `step`, got {kind_of(simulator)}")
     saved = copier.enter(simulator, seed)
     simulator = copier.load(saved)
-    driver.find_masks(simulator, info)
+    driver.find_masks(simulator, observation, info)
     return Start(saved, driver.view(simulator, observation, info))
 
 
