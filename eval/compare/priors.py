@@ -171,9 +171,15 @@ def load_for(folder: str, world: str, num_actions: int, action_names: Sequence[s
     """The prior saved in a folder, with its actions numbered as in a world: by name if both have names.
 
     Raises:
-        ValueError: the prior has other actions than the world, or samples an end symbol; or a file is damaged.
-        OSError: the folder, or a file in it, is not there.
+        ValueError: there is no such folder; the prior has other actions than the world, or samples an end symbol; or a
+            file is damaged.
+        OSError: a file in the folder is not there.
     """
+    if not Path(folder).is_dir():
+        raise ValueError(
+            f"`priors` must be folders of saved priors, got {folder!r}; kinds that are fitted, such as markov, are"
+            " named by --kinds"
+        )
     prior = load(folder)
     if prior.end is not None:
         raise ValueError(f"{folder}: samples an end symbol, which is no action of a world; train without --end")

@@ -16,7 +16,7 @@ BAD = {
         (["--worlds", "maze", "cliff", "--context", "initial"], "context: cliff offers no context of use"),
         (["--rounds", "-1"], "rounds"),
         (["--training-starts", "1"], "training_starts"),
-        (["--priors", "nowhere"], "nowhere"),
+        (["--priors", "nowhere"], "folders of saved priors, got 'nowhere'"),
         (["--priors", "gru"], "priors: gru is also the name of a fitted prior; give the folder as ./gru"),
         (["--seed", str(2**41)], "seed"),
         (["--planners", "best"], "sampling"),
