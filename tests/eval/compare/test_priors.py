@@ -200,7 +200,7 @@ def test_a_prior_that_does_not_fit_is_refused(tmp_path):
         load_for(folder, "taxi", 6, None)
     with refuses(folder, "'on'", "world maze", "up, right, down"):
         load_for(folder, "maze", 3, ("up", "on", "down"))
-    with refuses("nowhere", error=FileNotFoundError):
+    with refuses("nowhere", "folders of saved priors", "--kinds"):
         load_for(str(tmp_path / "nowhere"), "maze", 3, None)
     ends = save(MarkovPrior(4, 1).fit(learned().with_end()), tmp_path / "ends")
     with refuses("ends", "end symbol", "--end"):
