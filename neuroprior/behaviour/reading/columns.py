@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 
 from neuroprior.behaviour.reading.names import (
-    ACTORS,
     ANIMALS,
     DEEPETHOGRAM,
     HOUSINGS,
@@ -36,6 +35,8 @@ NOT_USED = "none"
 INDICATORS = frozenset(("0", "1", "", "-1", "true", "false", "0.0", "1.0", "-1.0"))
 MONTH = re.compile(r"(jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec)[a-z]*[._\- ]?(\d{2}|\d{4})", re.IGNORECASE)
 DATE_INSIDE = r"\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}:\d{2}:\d{2}"
+"""Occurs in lines of logs that have no cells."""
+
 NO_BEHAVIOURS = re.compile(r"(low[_ ]prob|in zone|result|probability|arena|zone|place|site|location)", re.IGNORECASE)
 """Columns of zeros and ones that programs write beside those of behaviours."""
 
@@ -290,15 +291,14 @@ def _fill_down(sheet: Sheet, roles: Roles) -> None:
     for use in ("subject", "recording", "factors"):
         for name in roles.at.get(use, []):
             column = frame[name]
-            given = column != ""
-            is_repeated = (column[given].shift() == column[given]).any()  # may be forgotten in some rows
-            as_others = frame[behaviour][~given].isin(frame[behaviour][given]).mean() >= 0.5  # not of nobody
-            if not given.all() and column.iloc[0] != "" and not is_repeated and given.mean() < 2 / 3 and as_others:
-                groups = [frame[one] for one in whole] or np.zeros(len(frame))
-                frame[name] = column.where(given).groupby(groups).ffill().fillna("")
-                roles.notes.append(
-                    f"the column {name!r} is filled where its values begin, and each is read to go on below it"
-                )
+            filled = column != ""
+            if len(frame) and filled.iloc[0] and filled.mean() < 2 / 3:
+                is_repeated = (column[filled].shift() == column[filled]).any()  # may be forgotten in some rows
+                as_others = frame[behaviour][~filled].isin(frame[behaviour][filled]).mean() >= 0.5  # not of nobody
+                if not is_repeated and as_others:
+                    frame[name] = column.where(filled).groupby(_number_groups(frame, whole)).ffill().fillna("")
+                    what = f"the column {name!r} is filled where its values begin"
+                    roles.notes.append(f"{what}, and each is read to go on below it")
             if use != "factors" and frame[name].ne("").all():
                 whole.append(name)
 
@@ -384,9 +384,10 @@ def _find_use(sheet: Sheet, roles: Roles, use: str, words: Mapping[str, str]) ->
             free = [name for name in sheet.frame if name not in roles.used() and sheet.frame[name].duplicated().any()]
             others = (*NAMES["behaviour"], *OF_NO_SUBJECT)
             ids = [name for name in free if plain(name).endswith(" id") and plain(name)[:-3] not in others]
-            fallback = (*ANIMALS, *ACTORS, *(HOUSINGS if "recording" not in roles.at else ()))
-            apart = [name for name in free if plain(name) in fallback and _are_numbered_anew(sheet, roles, [], name)]
-            kept = ids if len(ids) == 1 else apart
+            fallback = (*ANIMALS, *(HOUSINGS if "recording" not in roles.at else ()))
+            likely = [name for name in free if plain(name) in fallback]
+            starts = _starts(sheet, roles) if likely else None
+            kept = ids if len(ids) == 1 else [one for one in likely if _are_numbered_anew(sheet.frame, starts, [], one)]
     if kept:
         roles.infer(use, kept if use in ("factors", "context", "recording") else kept[:1])
 
@@ -398,8 +399,11 @@ def _check_is_in_one_column(sheet: Sheet, candidates: list[str]) -> None:
         ReadingError: columns of one name differ in their unit, and the smaller units stay below 60.
     """
     parts = [name for name in sheet.frame if candidates and plain(name) == plain(candidates[0])]
-    units = {unit_of_name(name): pd.to_numeric(sheet.frame[name], errors="coerce").max() for name in parts}
-    if len(units.keys() & {"h", "min", "s"}) > 1 and all(units[unit] < 60 for unit in units.keys() & {"min", "s"}):
+    of_unit = {unit_of_name(name): name for name in parts}
+    small = [sheet.frame[of_unit[unit]] for unit in ("min", "s") if unit in of_unit]
+    if len(of_unit.keys() & {"h", "min", "s"}) > 1 and all(
+        pd.to_numeric(one, errors="coerce").max() < 60 for one in small
+    ):
         raise ReadingError(
             f"{sheet.name}: a time must stand in one column, got {', '.join(parts)}; join them, such as 9:05:30"
         )
@@ -414,13 +418,15 @@ def _choose_recordings(sheet: Sheet, roles: Roles) -> None:
     chosen: list[str] = []
     subjects, candidates = roles.at.get("subject", []), roles.at.pop("recording", [])
     are_rows = roles.layout != "rows of sequences"
+    times = _starts(sheet, roles) if are_rows else None
+    names = [*(_periods(sheet, roles, candidates, times) if are_rows else []), *candidates]
     may_count = are_rows and len(sheet.frame) > 2 and (not subjects or bool(sheet.frame.duplicated(subjects).any()))
-    behaviour = sheet.frame[roles.at["behaviour"]]
-    recur = bool(behaviour.duplicated().mean() >= 0.5)  # where none does, each may be a sequence
-    for name in [*(_periods(sheet, roles, candidates) if are_rows else []), *candidates]:
+    # Where behaviours do not recur, each may be a sequence.
+    recur = len(names) > 1 and bool(sheet.frame[roles.at["behaviour"]].duplicated().mean() >= 0.5)
+    for name in names:
         groups = sheet.frame.groupby([*chosen, name], sort=False).ngroups
         before = sheet.frame.groupby(chosen, sort=False).ngroups if chosen else 0
-        within = chosen if recur and _rise(sheet, roles, [*subjects, *chosen]) else []
+        within = chosen if chosen and recur and _rise(sheet.frame, times, [*subjects, *chosen]) else []
         if may_count and not sheet.frame.duplicated([*subjects, *within, name]).any():
             where = "of a recording, " if within else "of a subject, " if subjects else ""
             roles.notes.append(f"the column {name!r} differs in each row {where}and is not used as recording")
@@ -437,7 +443,7 @@ def _sort_by_numbers(sheet: Sheet, roles: Roles) -> None:
         numbers = pd.to_numeric(sheet.frame[name], errors="coerce")
         if numbers.isna().any() or sheet.frame.duplicated([*keys, name]).any():
             continue
-        group = sheet.frame.groupby(keys, sort=False).ngroup() if keys else pd.Series(0, index=sheet.frame.index)
+        group = _number_groups(sheet.frame, keys)
         if (numbers.groupby(group).diff().dropna() > 0).all():
             return
         order = np.lexsort((numbers, group))
@@ -446,60 +452,69 @@ def _sort_by_numbers(sheet: Sheet, roles: Roles) -> None:
         return
 
 
-def _periods(sheet: Sheet, roles: Roles, recordings: list[str]) -> list[str]:
+def _periods(sheet: Sheet, roles: Roles, recordings: list[str], times: Any) -> list[str]:
     """Return the columns of days or weeks in which sessions are numbered anew, and of blocks in which trials are."""
     others = [name for use, names in roles.at.items() if use != "factors" for name in names]
     subjects = roles.at.get("subject", [])
-    trials = recordings and all(plain(name).startswith("trial") for name in recordings)
-    again = bool(trials) and bool(sheet.frame.duplicated([*subjects, *recordings]).any())
-    known = PERIODS if again else PERIODS[:-1]
-    periods = [name for name in sheet.frame if plain(name) in known and name not in [*others, *recordings]]
-    keys = [*subjects, *([] if trials else recordings)]
-    return [name for name in periods if _are_numbered_anew(sheet, roles, keys, name)]
+    are_trials = bool(recordings) and all(plain(name).startswith("trial") for name in recordings)
+    blocks = ("block",) if are_trials and sheet.frame.duplicated([*subjects, *recordings]).any() else ()
+    periods = [
+        name for name in sheet.frame if plain(name) in (*PERIODS, *blocks) and name not in [*others, *recordings]
+    ]
+    keys = [*subjects, *([] if are_trials else recordings)]
+    return [name for name in periods if _are_numbered_anew(sheet.frame, times, keys, name)]
 
 
-def _are_numbered_anew(sheet: Sheet, roles: Roles, keys: list[str], name: str) -> bool:
+def _are_numbered_anew(frame: Any, times: Any, keys: list[str], name: str) -> bool:
     """Return whether the rows of each value of a column stand together within `keys`, and its times begin anew.
 
-    Without times, whether most values have several rows.
+    Without times (None), whether most values have several rows.
     """
-    frame = sheet.frame
     number = frame.groupby([*keys, name], sort=False).ngroup().to_numpy()
-    key = frame.groupby(keys, sort=False).ngroup().to_numpy() if keys else np.zeros(len(frame), np.int64)
+    key = _number_groups(frame, keys)
     order = np.argsort(key, kind="stable")
     number, key = number[order], key[order]
     begins = np.flatnonzero(np.diff(number, prepend=-1) != 0)
     if len(begins) != len(np.unique(number)) or frame[name].eq("").any() or frame[name].nunique() < 2:
         return False
-    if "start" not in roles.at:
+    if times is None:
         return float(np.median(np.diff(np.append(begins, len(number))))) >= 2
-    times = _times(sheet, roles)[order]
+    ordered = times[order]
     changes = begins[1:][key[begins[1:]] == key[begins[1:] - 1]]
-    return len(changes) > 0 and float((times[changes] < times[changes - 1]).mean()) > 0.9
+    return len(changes) > 0 and float((ordered[changes] < ordered[changes - 1]).mean()) > 0.9
 
 
-def _times(sheet: Sheet, roles: Roles) -> Any:
-    """Return the times of the starts, float64 `[rows]`, whatever is wrong with them."""
-    texts = sheet.frame[roles.at["start"][-1]].to_numpy(object)
-    return read_times(texts, "start", sheet.place, Problems(), separator=sheet.separator).values
+def _number_groups(frame: Any, keys: list[str]) -> Any:
+    """Return the number of each row's group, int64 `[rows]`, in the order of appearance; one without keys."""
+    return frame.groupby(keys, sort=False).ngroup().to_numpy() if keys else np.zeros(len(frame), np.int64)
 
 
-def _rise(sheet: Sheet, roles: Roles, keys: list[str]) -> bool:
+def _read_quietly(sheet: Sheet, use: str, name: str) -> Any:
+    """Return the times in a column, float64 `[rows]`, whatever is wrong with them."""
+    texts = sheet.frame[name].to_numpy(object)
+    return read_times(texts, use, sheet.place, Problems(), separator=sheet.separator).values
+
+
+def _starts(sheet: Sheet, roles: Roles) -> Any:
+    """Return the times of the starts, float64 `[rows]`; None without a column of them."""
+    return _read_quietly(sheet, "start", roles.at["start"][-1]) if "start" in roles.at else None
+
+
+def _rise(frame: Any, times: Any, keys: list[str]) -> bool:
     """Return whether times, if there are any, rise from row to row within `keys`."""
-    if "start" not in roles.at or not keys:
+    if times is None:
         return True
-    times = pd.Series(_times(sheet, roles))
-    steps = times.groupby(sheet.frame.groupby(keys, sort=False).ngroup().to_numpy()).diff()
-    return bool((steps.dropna() >= 0).mean() > 0.95) if steps.notna().any() else True
+    steps = pd.Series(times).groupby(_number_groups(frame, keys)).diff().dropna()
+    return not len(steps) or bool((steps >= 0).mean() > 0.95)
 
 
 def _is_length_of_all(sheet: Sheet, roles: Roles, name: str) -> bool:
     """Return whether a duration is the same in all rows, and longer than the time between most of them."""
     if "start" not in roles.at or sheet.frame[name].nunique() > 1 or len(sheet.frame) < 3:
         return False
-    length = read_times(sheet.frame[name].to_numpy(object), "duration", sheet.place, Problems()).values[0]
+    length = _read_quietly(sheet, "duration", name)[0]
     factor = SECONDS.get(unit_of_name(name), 1.0) / SECONDS.get(unit_of_name(roles.at["start"][-1]), 1.0)
-    steps = np.diff(np.sort(_times(sheet, roles)))
+    steps = np.diff(np.sort(_starts(sheet, roles)))
     return bool(np.median(steps) < 0.5 * length * factor)
 
 
@@ -706,11 +721,13 @@ def _labelled_run(frame: Any, free: list[str], min_columns: int) -> list[str]:
     if min_columns >= MIN_WIDE:
         return best
     # Beside a time a neighbour that shows few of their labels is one of them.
-    labels = {name: one if not NO_BEHAVIOURS.match(name) else set() for name, one in labels.items()}
-    common, first, last = set().union(*(labels[name] for name in best)), free.index(best[0]), free.index(best[-1])
-    while first > 0 and len(labels[free[first - 1]] & common) >= 0.5 * max(len(labels[free[first - 1]]), 1):
+    common = set().union(*(labels[name] for name in best))
+    shares = [len(labels[name] & common) / max(len(labels[name]), 1) for name in free]
+    fits = [share >= 0.5 and not NO_BEHAVIOURS.match(name) for share, name in zip(shares, free, strict=True)]
+    first, last = free.index(best[0]), free.index(best[-1])
+    while first > 0 and fits[first - 1]:
         first -= 1
-    while last + 1 < len(free) and len(labels[free[last + 1]] & common) >= 0.5 * max(len(labels[free[last + 1]]), 1):
+    while last + 1 < len(free) and fits[last + 1]:
         last += 1
     return free[first : last + 1]
 
@@ -789,9 +806,11 @@ def _split_event_words(sheet: Sheet, roles: Roles, words: Mapping[str, str]) -> 
     if roles.layout != "events" or taken or "start" not in roles.at or len(roles.at["behaviour"]) > 1:
         return
     name = roles.at["behaviour"][0]
-    parts = sheet.frame[name].str.extract(r"^(.*\w)[\s_:.\-]+(\w+)$")
+    codes, labels = pd.factorize(sheet.frame[name])
+    parts = pd.Series(labels, dtype=object).str.extract(r"^(.*\w)[\s_:.\-]+(\w+)$")
     if parts.isna().any(axis=None) or _event_words(parts[1], words) != {"start", "stop"}:
         return
+    parts = parts.take(codes).reset_index(drop=True)
     keys = [sheet.frame[one] for use in ("recording", "subject") for one in roles.at.get(use, [])]
     kinds = parts[1].str.lower().groupby([*keys, parts[0]], sort=False)
     if (kinds.shift() == parts[1].str.lower()).mean() > 0.05 or (kinds.transform("size") < 2).mean() > 0.05:
@@ -847,20 +866,16 @@ def _has_equal_steps(sheet: Sheet, roles: Roles) -> bool:
     """Return whether there are times that grow by equal steps from row to row of each recording."""
     if "start" not in roles.at:
         return False
-    times = _times(sheet, roles)
-    groups = roles.at.get("recording")
-    same = np.diff(sheet.frame.groupby(groups, sort=False).ngroup()) == 0 if groups else np.ones(len(times) - 1, bool)
+    times = _starts(sheet, roles)
+    same = np.diff(_number_groups(sheet.frame, roles.at.get("recording", []))) == 0
     steps = np.diff(times)[same]
     return len(steps) > 1 and bool((np.isclose(steps, np.nanmedian(steps), rtol=0.02) & (steps > 0)).mean() > 0.9)
 
 
 def _are_bins(sheet: Sheet, roles: Roles) -> bool:
     """Return whether all rows take equally long, as bins of time do."""
-    start, stop = (
-        read_times(sheet.frame[roles.at[use][-1]].to_numpy(object), use, sheet.place, Problems()).values
-        for use in ("start", "stop")
-    )
-    return len(start) > 1 and bool(np.isclose(stop - start, np.nanmedian(stop - start), rtol=0.02).mean() > 0.9)
+    lengths = _read_quietly(sheet, "stop", roles.at["stop"][-1]) - _starts(sheet, roles)
+    return len(lengths) > 1 and bool(np.isclose(lengths, np.nanmedian(lengths), rtol=0.02).mean() > 0.9)
 
 
 def _note_unused(sheet: Sheet, roles: Roles, words: Mapping[str, str]) -> None:

@@ -15,51 +15,22 @@ UNIT_IN_BRACKETS = re.compile(rf"\s*[(\[]({ANY_UNIT}|hh:mm:ss(.ms)?|frames?|hz|m
 UNIT_AT_END = re.compile(rf",?\s[/,]?\s*({ANY_UNIT}|hh mm ss ms|hh mm ss|ss msec|seconds since start)$")
 
 KINDS_OF_SUBJECTS = (
-    "subject",
-    "animal",
-    "mouse",
-    "rat",
-    "bird",
-    "individual",
-    "participant",
-    "person",
-    "patient",
-    "child",
-    "user",
-    "player",
-    "tier",
-    "proband",
-    "vp",
-    "respondent",
-    "student",
-    "customer",
-    "visitor",
-    "worker",
-)
+    "subject", "animal", "mouse", "rat", "bird", "individual", "participant", "person", "patient", "child", "user",
+    "player", "tier", "proband", "vp", "respondent", "student", "customer", "visitor", "worker",
+)  # fmt: skip
 ANIMALS = ("monkey", "dog", "cat", "fish", "fly", "pig", "cow", "sheep", "goat", "horse", "hen", "larva", "worm", "bee")
-ACTORS = ("customer", "visitor", "worker")
 HOUSINGS = ("cage", "tank", "box", "chamber")
 """Columns that tell subjects apart where no other does, and rows of one stand together; housings where no column tells
 recordings apart either."""
 
 OF_NO_SUBJECT = (
-    "zone",
-    "camera",
-    "site",
-    "bout",
-    "channel",
-    "stimulus",
-    "location",
-    "place",
-    "arena",
-    "trial",
-    "video",
-)
+    "zone", "camera", "site", "bout", "channel", "stimulus", "location", "place", "arena", "trial", "video",
+)  # fmt: skip
 """What has numbers, but is no subject, nor are behaviours."""
 
 KEYS_OF_SUBJECTS = ("id", "no", "nr", "name", "#", "tag", "rfid")
 
-PERIODS = ("date", "datum", "day", "week", "visit", "block")
+PERIODS = ("date", "datum", "day", "week", "visit")
 """Columns within which sessions may be numbered anew."""
 
 NAMES: dict[str, tuple[str, ...]] = {
@@ -77,8 +48,8 @@ NAMES: dict[str, tuple[str, ...]] = {
         "participant id", "person", "person id", "id", "pid", "ind", "individu", "tier", "case concept name", "case id",
         "case", "idhous",
         "subj", "subj id", "sub", "actor", "initiator", "sujet", "sujeto", *KINDS_OF_SUBJECTS,
-        *(f"{kind} {key}" for kind in (*KINDS_OF_SUBJECTS, *ANIMALS, *ACTORS) for key in KEYS_OF_SUBJECTS),
-        *(f"id {kind}" for kind in (*KINDS_OF_SUBJECTS, *ANIMALS, *ACTORS)), "rfid", "id no",
+        *(f"{kind} {key}" for kind in (*KINDS_OF_SUBJECTS, *ANIMALS) for key in KEYS_OF_SUBJECTS),
+        *(f"id {kind}" for kind in (*KINDS_OF_SUBJECTS, *ANIMALS)), "rfid", "id no",
     ),
     "recording": (
         "recording", "recording id", "session", "session id", "observation", "observation id", "video", "video name",
@@ -210,27 +181,15 @@ WORDS = {
 """Words for the kinds of rows where starts and stops have rows of their own, in lower case."""
 
 ORDERS = (
-    "order",
-    "event order",
-    "step",
-    "seq no",
-    "sequence number",
-    "event number",
-    "event no",
-    "trial number",
-    "trial no",
-    "trial",
-    "rank",
-    "position",
-)
+    "order", "event order", "step", "seq no", "sequence number", "event number", "event no", "trial number", "trial no",
+    "trial", "rank", "position",
+)  # fmt: skip
 """Columns that number the events of a recording, where no times do."""
 
 STEM_NUMBER = re.compile(r"(.*?[^\d.])?[._\- ]?(\d+)")
 """A name that ends in a number: its stem, if any, and the number."""
 
-COUNTED = "|".join(
-    ("device", "trial", "event", "session", "block", "row", "line", "frame", "sample", "serial", "index")
-)
+COUNTED = "device|trial|event|session|block|row|line|frame|sample|serial|index"
 SUMMARY = re.compile(
     rf"\b(?:total|mean|median|average|std|sd|frequency|occurr?ences)\b|^(?!(?:{COUNTED}) number$).*\bnumber\b"
 )

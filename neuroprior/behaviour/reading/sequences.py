@@ -114,17 +114,18 @@ def strings_of_sequences(table: Table) -> Part | None:
     if timed.mean() <= 0.9:
         if filled.str.fullmatch(LIST).all() and (inside := _items_of_lists(table, filled)) is not None:
             is_sequence, filled = True, inside
-            cells = cells.where(cells == "", filled.reindex(cells.index))
+        elif letters := plain(names[0]) in CALLED_SEQUENCES and _are_letters(filled):
+            filled = filled.map(" ".join)
+        cells = cells.where(cells == "", filled.reindex(cells.index))
         keys = pd.Series(list(zip(table.recording, table.subject, strict=True)))
         counts = {one: float(filled.str.contains(one, regex=False).mean()) for one in SEPARATORS}
         alone = is_sequence or ("subject" in table.roles.at and keys.is_unique)
         alone = alone or any(counts[one] > 0.9 and filled.str.count(re.escape(one)).max() > 1 for one in ARROWS)
         separator = max(SEPARATORS, key=lambda one: counts[one])
         separator = _best_separator(filled, [one for one in SEPARATORS if counts[one] >= MIN_SEPARATED]) or separator
-        letters = plain(names[0]) in CALLED_SEQUENCES and counts[separator] == 0 and _are_letters(filled)
-        if not alone or (counts[separator] < MIN_SEPARATED and not letters):
+        if not alone or counts[separator] < MIN_SEPARATED:
             return None
-        pieces = [word for text in filled for word in (text if letters else text.split(separator))]
+        pieces = [word for text in filled for word in text.split(separator)]
         if len(set(pieces)) >= 0.9 * len(pieces) and len(filled) > 1:
             return None
     table.unit = "steps"
@@ -137,15 +138,15 @@ def strings_of_sequences(table: Table) -> Part | None:
         pieces_of = (
             STATE_AND_DURATION.findall(text)
             if not separator
-            else [(word.strip(), "1") for word in (text if letters else text.split(separator))]
+            else [(word.strip(), "1") for word in text.split(separator)]
         )
         rows += [row] * len(pieces_of)
         labels += [word.strip() for word, _ in pieces_of]
         lengths += [float(length) for _, length in pieces_of]
     row_of = np.array(rows, np.int64)
     ends = pd.Series(lengths).groupby(row_of).cumsum().to_numpy().astype(np.float64)
-    what = "states with durations" if not separator else f"behaviours parted by {separator!r}"
-    what = "each letter a behaviour" if letters else what
+    parted = "each letter a behaviour" if letters else f"behaviours parted by {separator!r}"
+    what = parted if separator else "states with durations"
     table.notes.append(f"each cell of {names[0]!r} is read as a sequence, {what}")
     named = table.labels(np.array(["" if word in SEQUENCE_MISSING else word for word in labels], dtype=object))
     return table.part(row_of, named, (ends - np.array(lengths)).astype(np.float64), ends)

@@ -49,9 +49,6 @@ TABLE_SUFFIXES = (
 )
 """Suffixes of the files of a folder that are read; .gz or .zip may follow."""
 
-HIDDEN = re.compile(r"__MACOSX$|\.[^.]")
-"""Parts of paths in archives that are not read."""
-
 HEADER_LINES = re.compile(r"number of header lines:?", re.IGNORECASE)
 NUMBER = re.compile(r"\s*[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?\s*")
 
@@ -99,7 +96,7 @@ def find_files(path: str | os.PathLike[str]) -> list[Path]:
     path = Path(path)
     if path.is_dir():
         inside = [file for file in path.rglob("*") if _is_table(file)]
-        files = sorted(file for file in inside if not any(name[0] == "." for name in file.relative_to(path).parts))
+        files = sorted(file for file in inside if not _is_hidden(file.relative_to(path)))
         if not files:
             raise ReadingError(f"{path}: the folder must hold tables ({', '.join(TABLE_SUFFIXES)}), got none")
         return files
@@ -110,6 +107,11 @@ def find_files(path: str | os.PathLike[str]) -> list[Path]:
     if not matches:
         raise FileNotFoundError(2, "No such file or directory", str(path))
     return [file for file in matches if file.is_file()]
+
+
+def _is_hidden(path: Path) -> bool:
+    """Return whether a path leads through what systems keep for themselves."""
+    return any(part == "__MACOSX" or (part[0] == "." and part != "..") for part in path.parts)
 
 
 def _is_table(file: Path) -> bool:
@@ -202,16 +204,14 @@ def _sheets_of_zip(content: bytes, name: str, label: str, stem: str, wanted: Seq
     if "[Content_Types].xml" in members or b"opendocument" in kind:
         yield from _sheets_of_workbook(content, label, stem, wanted)
         return
-    tables = [
-        member for member in members if not any(part == "__MACOSX" or part[0] == "." for part in Path(member).parts)
-    ]
+    tables = [member for member in members if not _is_hidden(Path(member))]
     if not tables:
         raise ReadingError(f"{label}: the archive must hold tables, got none")
-    names = [Path(member).name for member in tables]
-    for member, member_name in zip(tables, names, strict=True):
+    number = Counter(Path(member).name for member in tables)
+    for member in tables:
         called = label if len(tables) == 1 else f"{label}, {member}"
-        once = names.count(member_name) == 1
-        yield from _sheets_of_bytes(archive.read(member), member_name if once else member, called, wanted)
+        table_name = Path(member).name if number[Path(member).name] == 1 else member
+        yield from _sheets_of_bytes(archive.read(member), table_name, called, wanted)
 
 
 def _sheets_of_workbook(content: bytes, label: str, stem: str, wanted: Sequence[str]) -> Iterator[Sheet]:

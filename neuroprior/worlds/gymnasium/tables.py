@@ -16,7 +16,7 @@ from neuroprior.worlds.episodes import EpisodicWorld
 from neuroprior.worlds.gymnasium.counters import NUM_WALKS, WALK_LENGTH, Counters
 from neuroprior.worlds.gymnasium.environment import action_names, without_limits
 from neuroprior.worlds.simulators.copies import ReplayCopier
-from neuroprior.worlds.simulators.driver import TRUNCATED, View
+from neuroprior.worlds.simulators.driver import MASK_METHODS, TRUNCATED, View
 from neuroprior.worlds.simulators.fingerprints import digest
 from neuroprior.worlds.simulators.generators import keep_global_generators, seed_generators, state_of_generators
 from neuroprior.worlds.simulators.trials import Start
@@ -27,9 +27,6 @@ CHECKED_FIRST, CHECKED_EVERY = 100, 10
 
 REPEATS_OF_NOISE = 8
 """How often a transition is repeated that draws random numbers."""
-
-MASK_METHODS = ("action_masks", "action_mask")
-"""Methods of an environment that say which actions are legal."""
 
 
 def has_table(env: Any) -> bool:
@@ -59,8 +56,8 @@ def find_change(env: Any) -> str | None:
         for _ in range(WALK_LENGTH):
             state, action = int(walker.s), int(draw.integers(walker.action_space.n))
             _, reward, ended, truncated, _ = walker.step(action)
-            told = [(int(to), float(gain), bool(end)) for p, to, gain, end in walker.P[state][action] if p > 0]
-            if (int(walker.s), float(reward), bool(ended)) not in told:
+            possible = [(int(to), float(gain), bool(end)) for p, to, gain, end in walker.P[state][action] if p > 0]
+            if (int(walker.s), float(reward), bool(ended)) not in possible:
                 return f"action {action} in state {state} led to another state, reward or end than its table says"
             if ended or truncated:
                 break

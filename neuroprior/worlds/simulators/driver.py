@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neuroprior._checks import kind_of
 from neuroprior.worlds.observations import Categories, Features
 from neuroprior.worlds.simulators.copies import Copier
 from neuroprior.worlds.simulators.generators import (
@@ -65,10 +64,29 @@ def _same(observation: Any) -> Any:
     return observation
 
 
-def _told_mask(observation: Any, info: Any) -> Any:
-    """The `action_mask` in an info or, as PettingZoo has it, in an observation that is a dict; None for none."""
-    dicts = [told for told in (info, observation) if isinstance(told, dict)]
-    return next((told["action_mask"] for told in dicts if "action_mask" in told), None)
+def _mask_in(*sources: Any) -> Any:
+    """The `action_mask` of the first source that is a dict with one: infos, PettingZoo's observations; None: none."""
+    return next((one["action_mask"] for one in sources if isinstance(one, dict) and "action_mask" in one), None)
+
+
+def _outcome(result: Any) -> tuple[float, int]:
+    """The reward that a simulator's `step` returned, and whether and how the episode ended.
+
+    Raises:
+        ValueError: it returned something else.
+    """
+    if not isinstance(result, tuple) or len(result) not in (3, 5):
+        raise ValueError(
+            "`step` must return (observation, reward, ended) or Gymnasium's five, got"
+            f" {len(result) if isinstance(result, tuple) else type(result).__name__}"
+        )
+    try:
+        ended = TERMINATED if result[2] else TRUNCATED if len(result) == 5 and result[3] else RUNNING
+        return float(result[1]), ended  # now: a simulator may return the same array again
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"`step` must return (observation, reward, ended) with a number as reward and True or False as end: {error}"
+        ) from error
 
 
 class Driver:
@@ -109,7 +127,7 @@ class Driver:
                 (_Method(name) for name in MASK_METHODS if _Method(name).of(simulator) is not None), None
             )
             self.reads_mask = self.legal_actions is not None
-        self.has_masks = self.has_masks or self.reads_mask or _told_mask(observation, info) is not None
+        self.has_masks = self.has_masks or self.reads_mask or _mask_in(info, observation) is not None
 
     def take(self, simulator: Any, action: int) -> tuple[Any, float, int, Any]:
         """Take an action: the observation, the reward, whether and how the episode ended, and the info.
@@ -118,16 +136,8 @@ class Driver:
             ValueError: `step` returns something else.
         """
         result = simulator.step(action + self.first_action)
-        if not isinstance(result, tuple) or len(result) not in (3, 5):
-            raise ValueError(
-                "`step` must return (observation, reward, ended) or Gymnasium's five, got"
-                f" {len(result) if isinstance(result, tuple) else type(result).__name__}"
-            )
-        try:
-            ended = TERMINATED if result[2] else TRUNCATED if len(result) == 5 and result[3] else RUNNING
-            return result[0], float(result[1]), ended, result[4] if len(result) == 5 else None
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"`step` must return a number as reward and True or False as end: {error}") from error
+        reward, ended = _outcome(result)
+        return result[0], reward, ended, result[4] if len(result) == 5 else None
 
     def view(self, simulator: Any, observation: Any, info: Any) -> View:
         """What can be seen and done in the state of a simulator, of which the last step told `observation` and `info`.
@@ -140,7 +150,7 @@ class Driver:
             assert self.legal_actions is not None
             mask = self.legal_actions(simulator)
         else:
-            mask = _told_mask(observation, info)
+            mask = _mask_in(info, observation)
         if mask is not None:
             mask = np.asarray(mask)
             if mask.shape != (self.num_actions,):
@@ -207,20 +217,13 @@ class Driver:
 
     def _hurry(self, simulator: Any, actions: Sequence[int]) -> Path:
         """`follow` without views, and with as little beside the simulator's steps as possible."""
-        step, first, rewards, ended = simulator.step, self.first_action, list[float](), False
+        step, first, rewards, ended = simulator.step, self.first_action, list[float](), RUNNING
         for action in actions:
-            result = step(action + first)
-            try:
-                rewards.append(float(result[1]))  # now: a simulator may return the same array again
-                ended = bool(result[2] or (len(result) == 5 and result[3]))
-            except (TypeError, ValueError, IndexError) as error:
-                raise ValueError(
-                    f"`step` must return (observation, reward, ended) or Gymnasium's five, of which the reward is a"
-                    f" number, got {kind_of(result)} ({error})"
-                ) from error
+            reward, ended = _outcome(step(action + first))
+            rewards.append(reward)
             if ended:
                 break
-        return Path(list(actions[: len(rewards)]), rewards, [], [], ended)
+        return Path(list(actions[: len(rewards)]), rewards, [], [], bool(ended))
 
 
 class _Method:

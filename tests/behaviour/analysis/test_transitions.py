@@ -213,10 +213,10 @@ def test_intervals_leave_out_a_subject():
 def test_of_what_always_follows_the_lower_bound_is_exact():
     """Three subjects show it with .025 at most where its probability is so low; of one subject nothing is known."""
     actions = torch.tensor([[0, 1, 0, 1], [0, 1, 1, 1], [0, 1, 0, 1], [1, 0, 1, 0], [2, 2, 2, 2]])
-    found = transitions(Plans(actions, 3, group=torch.tensor([4, 4, 7, 9, 9])), 9, seeded(0))
-    assert [found.low[0, 0, 1], found.high[0, 0, 1]] == pytest.approx([0.025 ** (1 / 3), 1])
-    assert found.low[0, 2, 2].isnan()
-    assert found.high[0, 2, 2].isnan()
+    result = transitions(Plans(actions, 3, group=torch.tensor([4, 4, 7, 9, 9])), 9, seeded(0))
+    assert [result.low[0, 0, 1], result.high[0, 0, 1]] == pytest.approx([0.025 ** (1 / 3), 1])
+    assert result.low[0, 2, 2].isnan()
+    assert result.high[0, 2, 2].isnan()
 
 
 def test_whole_subjects_are_permuted_between_conditions():

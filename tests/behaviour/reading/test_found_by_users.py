@@ -212,7 +212,7 @@ def test_recordings_of_one_name_in_two_files_are_two_unless_their_subjects_are_k
         rows = [f"{day},{label},{start}{subject}" for day in ("day 1", "day 2") for start in (1, 2, 4)]
         header = "session,behaviour,start" + ",animal" * bool(subject)
         (tmp_path / f"{name}.csv").write_text("\n".join([header, *rows]) + "\n")
-    found = read([tmp_path / "a.csv", tmp_path / "b.csv"])
-    recordings = found.events.drop_duplicates(["recording", "subject"])
-    assert list(recordings["subject"] + "/" + recordings["recording"]) == due
-    assert any("files' names are put before" in note for note in found.notes) == (not subjects[0])
+    recordings = read([tmp_path / "a.csv", tmp_path / "b.csv"])
+    timelines = recordings.events.drop_duplicates(["recording", "subject"])
+    assert list(timelines["subject"] + "/" + timelines["recording"]) == due
+    assert any("files' names are put before" in note for note in recordings.notes) == (not subjects[0])

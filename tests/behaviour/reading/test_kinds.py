@@ -514,8 +514,8 @@ def test_the_unit_of_durations_alone(study):
 
 def test_a_factor_that_is_empty_in_some_recordings_is_noted(study):
     rows = ["m1,a,drug", "m1,b,drug", "m2,b,", "m2,a,", "m3,a,saline", "m4,b,"]
-    found = study("animal,behaviour,treatment\n" + "\n".join(rows) + "\n")
-    notes = [note for note in found.notes if "'treatment'" in note]
+    recordings = study("animal,behaviour,treatment\n" + "\n".join(rows) + "\n")
+    notes = [note for note in recordings.notes if "'treatment'" in note]
     assert len(notes) == 1
     assert "empty in 2 of 4 recordings (first of 'm2')" in notes[0]
 
@@ -579,36 +579,36 @@ def test_recordings_are_told_apart(text, due, study):
     ],
 )
 def test_units_of_starts_and_of_stops(header, ends, stops, unit, study):
-    found = study(f"animal,behaviour,{header}\na,x,0,{ends[0]}\na,y,60,{ends[1]}\n")
-    assert tuple(found.events["stop"]) == pytest.approx(stops)
-    assert found.unit == unit
+    recordings = study(f"animal,behaviour,{header}\na,x,0,{ends[0]}\na,y,60,{ends[1]}\n")
+    assert tuple(recordings.events["stop"]) == pytest.approx(stops)
+    assert recordings.unit == unit
 
 
 def test_words_for_missing_are_no_levels_and_levels_alike_are_noted(study):
-    found = study("id,treatment,behaviour\n1,drug,x\n2,Drug,x\n3,NA,y\n4,n/a,x\n5,saline,y\n")
-    assert list(found.events["treatment"]) == ["drug", "Drug", "", "", "saline"]
-    assert "the levels 'Drug' and 'drug' of 'treatment' are nearly alike" in found.notes
+    recordings = study("id,treatment,behaviour\n1,drug,x\n2,Drug,x\n3,NA,y\n4,n/a,x\n5,saline,y\n")
+    assert list(recordings.events["treatment"]) == ["drug", "Drug", "", "", "saline"]
+    assert "the levels 'Drug' and 'drug' of 'treatment' are nearly alike" in recordings.notes
 
 
 def test_recordings_of_sequences_are_named_by_what_divides_them(study):
-    found = study("session,file,a1,a2,a3\n1,f1,x,y,x\n2,f2,y,y,x\n3,f3,x,x,z\n")
-    assert list(found.events["recording"].unique()) == ["1", "2", "3"]
+    recordings = study("session,file,a1,a2,a3\n1,f1,x,y,x\n2,f2,y,y,x\n3,f3,x,x,z\n")
+    assert list(recordings.events["recording"].unique()) == ["1", "2", "3"]
 
 
 def test_two_levels_may_be_words_for_missing(study):
     for other in ("null", "-", "NA"):
-        found = study(f"id,genotype,behaviour\n1,wt,x\n2,{other},x\n3,{other},y\n4,wt,x\n")
-        assert list(found.events["genotype"]) == ["wt", other, other, "wt"]
+        recordings = study(f"id,genotype,behaviour\n1,wt,x\n2,{other},x\n3,{other},y\n4,wt,x\n")
+        assert list(recordings.events["genotype"]) == ["wt", other, other, "wt"]
 
 
 def test_levels_go_on_within_a_subject_alone(study):
-    found = study("id,treatment,behaviour\na,drug,x\na,,y\na,,x\nb,,x\nb,,y\nc,saline,x\nc,,x\n")
-    assert list(found.events["treatment"]) == ["drug"] * 3 + [""] * 2 + ["saline"] * 2
+    recordings = study("id,treatment,behaviour\na,drug,x\na,,y\na,,x\nb,,x\nb,,y\nc,saline,x\nc,,x\n")
+    assert list(recordings.events["treatment"]) == ["drug"] * 3 + [""] * 2 + ["saline"] * 2
 
 
 def test_one_behaviour_a_row_in_columns_beside_starts_and_stops(study):
-    found = study("start,stop,x,y,z\n0,4,1,0,0\n4,5,0,1,0\n5,11,1,0,0\n11,13,0,0,1\n")
-    assert labels(found) == [["x", "y", "x", "z"]]
+    recordings = study("start,stop,x,y,z\n0,4,1,0,0\n4,5,0,1,0\n5,11,1,0,0\n11,13,0,0,1\n")
+    assert labels(recordings) == [["x", "y", "x", "z"]]
 
 
 def test_objects_of_bouts(study):
@@ -649,12 +649,14 @@ def test_an_event_log_has_starts_completions_and_completions_alone(study):
     header = "case:concept:name,concept:name,time:timestamp,lifecycle:transition\n"
     lines = [("a", "x", 0, "start"), ("a", "x", 4, "complete"), ("a", "y", 5, "complete"), ("a", "z", 6, "schedule")]
     lines += [("b", "y", 1, "complete"), ("b", "x", 2, "start"), ("b", "x", 9, "complete")]
-    found = study(header + "".join(f"{case},{what},2024-05-01 08:00:0{at},{kind}\n" for case, what, at, kind in lines))
-    begin = found.events["start"].min()
-    bouts = [(case, what, start - begin, stop - begin) for case, what, start, stop in rows(found)]
+    recordings = study(
+        header + "".join(f"{case},{what},2024-05-01 08:00:0{at},{kind}\n" for case, what, at, kind in lines)
+    )
+    begin = recordings.events["start"].min()
+    bouts = [(case, what, start - begin, stop - begin) for case, what, start, stop in rows(recordings)]
     assert bouts == [("a", "x", 0, 4), ("a", "y", 5, 5), ("b", "y", 1, 1), ("b", "x", 2, 9)]
-    assert any("2 completions have no start" in note for note in found.notes)
-    assert any("1 rows are neither starts nor completions (schedule)" in note for note in found.notes)
+    assert any("2 completions have no start" in note for note in recordings.notes)
+    assert any("1 rows are neither starts nor completions (schedule)" in note for note in recordings.notes)
 
 
 def test_labels_that_end_in_start_and_stop(study):
@@ -666,8 +668,8 @@ def test_labels_that_end_in_start_and_stop(study):
         ("b", 2, "rest start"),
     ]
     lines += [("b", 9, "rest stop")]
-    found = study("animal,time,event\n" + "".join(f"{animal},{at},{what}\n" for animal, at, what in lines))
-    assert rows(found) == [("a", "rest", 0, 3), ("a", "walk", 1, 4), ("b", "rest", 2, 9)]
+    recordings = study("animal,time,event\n" + "".join(f"{animal},{at},{what}\n" for animal, at, what in lines))
+    assert rows(recordings) == [("a", "rest", 0, 3), ("a", "walk", 1, 4), ("b", "rest", 2, 9)]
     one = study("animal,time,event\na,0,lights on\na,2,rest\na,5,lights off\n")
     assert labels(one) == [["lights on", "rest", "lights off"]]
     jumps = study("animal,time,event\na,0,jump on\na,2,jump on\na,5,jump off\na,6,jump off\nb,3,jump on\nb,4,jump on\n")
@@ -675,8 +677,8 @@ def test_labels_that_end_in_start_and_stop(study):
 
 
 def test_the_length_of_the_session_is_no_duration(study):
-    found = study("animal,time,behaviour,length_min\na,0,x,10\na,5,y,10\na,9,x,10\n")
-    assert rows(found) == [("a", "x", 0, None), ("a", "y", 5, None), ("a", "x", 9, None)]
+    recordings = study("animal,time,behaviour,length_min\na,0,x,10\na,5,y,10\na,9,x,10\n")
+    assert rows(recordings) == [("a", "x", 0, None), ("a", "y", 5, None), ("a", "x", 9, None)]
 
 
 def test_a_stop_before_its_start_is_shown_as_it_is_written(study):
@@ -694,6 +696,6 @@ def test_the_sheet_of_the_events_is_read_wherever_the_legend_stands(legend_first
     with pd.ExcelWriter(tmp_path / "f.xlsx") as file:
         for name, page in pages if legend_first else [*pages[1:], pages[0]]:
             page.to_excel(file, sheet_name=name, index=False)
-    found = read(tmp_path / "f.xlsx")
-    assert (len(found.events), set(found.events["subject"])) == (24, {"a", "b", "c"})
-    assert any("Ethogram" in note and "not read" in note for note in found.notes)
+    recordings = read(tmp_path / "f.xlsx")
+    assert (len(recordings.events), set(recordings.events["subject"])) == (24, {"a", "b", "c"})
+    assert any("Ethogram" in note and "not read" in note for note in recordings.notes)
